@@ -62,8 +62,8 @@ class Screen:
 
     @property
     def threshold(self) -> float:
-        """Evidence that noise alone exceeds once in a thousand comparisons."""
-        return ev.threshold(self.largest)
+        """Evidence that noise alone exceeds once in a thousand comparisons; infinite if nothing was scored."""
+        return ev.threshold(self.largest) if np.all(np.isfinite(self.largest)) else np.inf
 
     @property
     def changes(self) -> int:

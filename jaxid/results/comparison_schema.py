@@ -82,7 +82,7 @@ def comparison_schema() -> dict[str, Any]:
         "why": {"type": ["string", "null"], "description": "what differs if nothing known explains it"},
         "alike": {**_WORDS, "description": "effects that the case lacks in all logs alike"},
         "tried": {"type": "integer", "description": "number of changes that were compared"},
-        "threshold": _NUMBER,
+        "threshold": {**_MAYBE, "description": "that of the first differences; null if nothing may differ"},
         "false_alarm": {**_NUMBER, "description": "rate of false alarms at the threshold"},
         "parameters": {"type": "object", "additionalProperties": _VALUE},
         "gap": {
