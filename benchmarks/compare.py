@@ -185,7 +185,7 @@ def markdown(table: dict, records: Sequence[dict]) -> str:
         f"Effects that the model lacks in both alike: {', '.join(ALIKE)}.",
         "",
         f"Aims: {100 * NAMED_AIM:.0f} % of what an oracle sees named, {FALSE_AIM} false: "
-        f"{'held' if table['aims_hold'] else 'missed'}.",
+        f"{'held' if table['aims_hold'] else 'missed'}{' so far' if table['left'] else ''}.",
         "",
     ]
     wrong = [
