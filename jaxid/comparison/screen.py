@@ -62,7 +62,7 @@ class Screen:
 
     @property
     def threshold(self) -> float:
-        """Evidence that noise alone exceeds once in a thousand comparisons; infinite if nothing was scored."""
+        """Evidence that noise alone exceeds once in a thousand comparisons; infinite if none was scored."""
         return ev.threshold(self.largest) if np.all(np.isfinite(self.largest)) else np.inf
 
     @property
