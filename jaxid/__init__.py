@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from jaxid.case.case import load_case as load_case
     from jaxid.commands.check import Check as Check
     from jaxid.commands.check import check as check
+    from jaxid.commands.compare import compare as compare
     from jaxid.commands.design import design as design
     from jaxid.commands.discover import discover as discover
     from jaxid.commands.identify import Identification as Identification
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from jaxid.commands.live import follow as follow
     from jaxid.commands.simulate import simulate as simulate
     from jaxid.commands.study import study as study
+    from jaxid.comparison.result import Comparison as Comparison
     from jaxid.controllers import CONTROLLERS as CONTROLLERS
     from jaxid.controllers import Controller as Controller
     from jaxid.controllers import Tick as Tick
@@ -95,6 +97,7 @@ _HOMES = {
     "identify": ("jaxid.commands.identify", "identify"),
     "identify_many": ("jaxid.commands.identify", "identify_many"),
     "discover": ("jaxid.commands.discover", "discover"),
+    "compare": ("jaxid.commands.compare", "compare"),
     "init": ("jaxid.commands.init", "init"),
     "simulate": ("jaxid.commands.simulate", "simulate"),
     "design": ("jaxid.commands.design", "design"),
@@ -111,6 +114,7 @@ _HOMES = {
     # results
     "Identification": ("jaxid.commands.identify", "Identification"),
     "Discovery": ("jaxid.discovery.result", "Discovery"),
+    "Comparison": ("jaxid.comparison.result", "Comparison"),
     "Check": ("jaxid.commands.check", "Check"),
     "Study": ("jaxid.studies.result", "Study"),
     "FirstCase": ("jaxid.commands.init", "FirstCase"),

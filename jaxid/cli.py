@@ -45,7 +45,7 @@ _EXAMPLES = {
     "methods": "jaxid methods",
     "plants": "jaxid plants",
     "effects": "jaxid effects\njaxid effects cogging\njaxid effects stribeck_friction -o stribeck.png",
-    "schema": "jaxid schema case > case.schema.json",
+    "schema": "jaxid schema case > case.schema.json\njaxid schema comparison",
     "init": "jaxid init log.csv\njaxid init joint_states.csv --urdf arm.urdf -o arm.toml\n"
     "jaxid init log.csv --mjcf robot.xml -o arm.toml",
     "simulate": "jaxid simulate case.toml -o log.csv\njaxid simulate case.toml -o log.csv --seed 3",
@@ -57,6 +57,9 @@ _EXAMPLES = {
     "jaxid identify case.toml log.csv --method inverse_dynamics",
     "discover": "jaxid discover case.toml log.csv -o out\n"
     "jaxid discover case.toml log.csv --validate other.csv --max-effects 2",
+    "compare": "jaxid compare axis.toml monday.csv friday.csv -o friday\n"
+    "jaxid compare axis.toml machine_1.csv machine_2.csv machine_3.csv\n"
+    "jaxid compare axis.toml",
     "study": "jaxid study case.toml -o study --runs 50\njaxid study case.toml -o study --resume",
     "export": "jaxid export out/result.json --to mjcf -o found.xml --check log.csv\n"
     "jaxid export out/result.json --to urdf --model robot.urdf -o found.urdf\n"
@@ -163,6 +166,7 @@ def _parser() -> argparse.ArgumentParser:
     _check(commands)
     _identify(commands)
     _discover(commands)
+    _compare(commands)
     _study(commands)
     _export(commands)
     _report(commands)
@@ -230,7 +234,9 @@ def _result(parser: argparse.ArgumentParser) -> None:
 def _schema(commands: argparse._SubParsersAction) -> None:
     what = "the JSON Schema of a file, for editors that complete and check by it"
     parser = _plain(commands, "schema", what, _run_schema)
-    parser.add_argument("file", metavar="FILE", choices=("case",), help="case: the case file")
+    choices = ("case", "comparison")
+    help_text = "case: the case file; comparison: what compare writes"
+    parser.add_argument("file", metavar="FILE", choices=choices, help=help_text)
 
 
 def _add(
@@ -397,6 +403,19 @@ def _discover(commands: argparse._SubParsersAction) -> None:
         action=argparse.BooleanOptionalAction,
         default=None,
         help="design experiments that separate rival effects; default: except for arms (minutes)",
+    )
+
+
+def _compare(commands: argparse._SubParsersAction) -> None:
+    purpose = "find what differs between logs: a parameter, or an effect in one of them only"
+    parser = _add(commands, "compare", purpose, _run_compare)
+    parser.add_argument("case", metavar="CASE.toml", help="the case of the machine")
+    parser.add_argument(
+        "log", metavar="LOG", nargs="*", help="the logs, the base first; absent: those of [[fit]]"
+    )
+    parser.add_argument("-o", metavar="DIR", help="folder for the results; default: only print them")
+    parser.add_argument(
+        "--max-changes", metavar="N", type=int, default=5, help="most changes of the model; default: 5"
     )
 
 
@@ -579,9 +598,12 @@ def _run_plot(args: argparse.Namespace) -> int:
 def _run_schema(args: argparse.Namespace) -> int:
     import json
 
-    from jaxid.case.json_schema import case_schema
+    if args.file == "comparison":
+        from jaxid.results.comparison_schema import comparison_schema as schema
+    else:
+        from jaxid.case.json_schema import case_schema as schema
 
-    print(json.dumps(case_schema(), indent=2, ensure_ascii=False))
+    print(json.dumps(schema(), indent=2, ensure_ascii=False))
     return 0
 
 
@@ -713,6 +735,20 @@ def _run_discover(args: argparse.Namespace) -> int:
     from jaxid.results.as_json import discovery_files
 
     return _finish(args, result, *discovery_files(result, Path(args.o or ".")), made=made)
+
+
+def _run_compare(args: argparse.Namespace) -> int:
+    if args.max_changes < 1:
+        raise InputError(f"--max-changes is {args.max_changes}", hint="give one or more")
+    _ready(args, "comparison.json", "report.html")
+    _sound(args)
+    with _progress(args) as show:
+        show("starting")
+        from jaxid.commands.compare import compare
+
+        result = compare(args.case, args.log or None, max_changes=args.max_changes, progress=show)
+    print(result)
+    return _finish(args, result, "comparison.json", "report.html")
 
 
 def _run_study(args: argparse.Namespace) -> int:

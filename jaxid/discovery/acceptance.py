@@ -104,23 +104,8 @@ class Acceptance:
         return float((before - after) / max(before - self._noise, 0.5 * before))
 
     def absorbed_noise(self, samples: cand.CandidateSamples, old: np.ndarray, new: np.ndarray) -> float:
-        """Return the part of the noise that the new model's drive filters out and the old one's does not.
-
-        Noise of the logged force exists in the log only. A drive that filters the force filters that noise
-        too, and would gain by it without explaining anything.
-
-        Returns:
-            Difference of the mean squares of whitened noise, at most 0.9.
-        """
-        if not samples.noisier:
-            return 0.0
-        whitener = ev.Whitener(self.colour, samples.moving)
-        squares = []
-        for theta in (old, new):
-            e, _ = cand.evaluate(self.superset, samples, theta, ())
-            noisier, _ = cand.evaluate_on(self.superset, samples.noisier, theta, ())
-            squares.append(float(np.mean(whitener((noisier - e)[..., None]) ** 2)))
-        return min(squares[0] - squares[1], 0.9)
+        """Return the part of the noise that a new model's drive filters out; see `absorbed_noise`."""
+        return absorbed_noise(self.superset, samples, self.colour, old, new)
 
     def confirmed(
         self, old: np.ndarray, new: np.ndarray, *, drive: bool
@@ -216,3 +201,35 @@ class Acceptance:
 
     def _sum(self, e: np.ndarray) -> float:
         return float(np.sum(np.where(self.samples.moving, e, 0.0) ** 2))
+
+
+def absorbed_noise(
+    superset: cand.CandidateModel,
+    samples: cand.CandidateSamples,
+    colour: tuple[NoiseModel, ...],
+    old: np.ndarray,
+    new: np.ndarray,
+) -> float:
+    """Return the part of the noise that the new model's drive filters out and the old one's does not.
+
+    Noise of the logged force exists in the log only. A drive that filters the force filters that noise
+    too, and would gain by it without explaining anything.
+
+    Args:
+        superset: Machine with all candidates.
+        samples: Samples of the log.
+        colour: Noise expected from the sensors, by joint.
+        old, new: All unknowns of the two models.
+
+    Returns:
+        Difference of the mean squares of whitened noise, at most 0.9.
+    """
+    if not samples.noisier:
+        return 0.0
+    whitener = ev.Whitener(colour, samples.moving)
+    squares = []
+    for theta in (old, new):
+        e, _ = cand.evaluate(superset, samples, theta, ())
+        noisier, _ = cand.evaluate_on(superset, samples.noisier, theta, ())
+        squares.append(float(np.mean(whitener((noisier - e)[..., None]) ** 2)))
+    return min(squares[0] - squares[1], 0.9)

@@ -22,7 +22,7 @@ _STRETCHES = 20
 # Ridge added to a normal matrix, relative to its diagonal.
 _RIDGE = 1e-9
 # Probability that noise alone exceeds the threshold with any of the candidates.
-_FALSE_POSITIVE = 1e-3
+FALSE_POSITIVE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -84,11 +84,15 @@ class Whitener:
         """Return the block of time of every row, in ascending order."""
         return np.sort(self._blocks())
 
-    def _blocks(self) -> np.ndarray:
+    def stretches(self, count: int) -> np.ndarray:
+        """Return the stretch of time of every row, of so many of equal length."""
+        return self._blocks(count)[self._order]
+
+    def _blocks(self, count: int = BLOCKS) -> np.ndarray:
         parts = []
         for i in range(len(self.noise)):
             n = int(self.rows[:, i].sum())
-            parts.append(np.minimum(np.arange(n) * BLOCKS // max(n, 1), BLOCKS - 1))
+            parts.append(np.minimum(np.arange(n) * count // max(n, 1), count - 1))
         return np.concatenate(parts)
 
 
@@ -324,7 +328,7 @@ def flipped(
 
 
 def threshold(largest: Float[np.ndarray, " runs"]) -> float:
-    """Return the evidence that noise alone exceeds with probability `_FALSE_POSITIVE`.
+    """Return the evidence that noise alone exceeds with probability `FALSE_POSITIVE`.
 
     Args:
         largest: Largest evidence over all candidates, for each surrogate.
@@ -332,6 +336,22 @@ def threshold(largest: Float[np.ndarray, " runs"]) -> float:
     Source:
         Gumbel's distribution of maxima, fitted by moments.
     """
-    scale = np.std(largest) * np.sqrt(6) / np.pi
-    location = np.mean(largest) - 0.5772 * scale
-    return float(location - scale * np.log(-np.log(1 - _FALSE_POSITIVE)))
+    location, scale = _gumbel(largest)
+    return float(location - scale * np.log(-np.log(1 - FALSE_POSITIVE)))
+
+
+def false_alarm(evidence: float, largest: Float[np.ndarray, " runs"]) -> float:
+    """Return the probability that noise alone reaches an evidence with any of the candidates.
+
+    Args:
+        evidence: The evidence [nats].
+        largest: Largest evidence over all candidates, for each surrogate.
+    """
+    location, scale = _gumbel(largest)
+    return float(-np.expm1(-np.exp(-(evidence - location) / max(scale, 1e-300))))
+
+
+def _gumbel(largest: Float[np.ndarray, " runs"]) -> tuple[float, float]:
+    """Return location and scale of Gumbel's distribution, fitted by moments."""
+    scale = float(np.std(largest) * np.sqrt(6) / np.pi)
+    return float(np.mean(largest)) - 0.5772 * scale, scale

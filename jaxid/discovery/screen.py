@@ -88,9 +88,9 @@ def screen_candidates(search: Search, model: Model, *, ahead: bool = False) -> S
     for c in rest:
         if c.has_grid:
             points.extend(search.grid_points(c))
-    points = [p for p in points if _has_influence(p, counts, scale)]
+    points = [p for p in points if has_influence(p, counts, scale)]
 
-    extra = _all_columns(e, base, points, counts, scale)
+    extra = all_columns(e, base, points, counts, scale)
     whitener, noise = fit_whitener(e, base, extra, counts, search.colour)
     out = Screen.of(whitener, e, base)
     white, columns = whitener(e[..., None]), whitener(base)
@@ -103,7 +103,7 @@ def screen_candidates(search: Search, model: Model, *, ahead: bool = False) -> S
     return out
 
 
-def _has_influence(p: cand.Point, counts: np.ndarray, scale: np.ndarray) -> bool:
+def has_influence(p: cand.Point, counts: np.ndarray, scale: np.ndarray) -> bool:
     """Check that a drive effect has an influence at its start that noise would not hide.
 
     Residuals are in units of the declared force, so that every effect on the drive also scales them a little.
@@ -236,7 +236,7 @@ def _guess(
     return np.where(c.amplitude, amount, 1.0) * c.starts[p.start]
 
 
-def _all_columns(
+def all_columns(
     e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
     """Return the columns of every candidate with few starts, and of one with many if it clearly explains."""

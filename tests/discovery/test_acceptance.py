@@ -11,7 +11,7 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery.acceptance import Acceptance
 from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
-from jaxid.discovery.screen import _has_influence
+from jaxid.discovery.screen import has_influence
 from jaxid.discovery.search import Model
 from jaxid.discovery.where import _bin_offset
 from jaxid.gap import noise_density
@@ -226,7 +226,7 @@ def test_a_line_is_placed_between_the_bins(true):
     assert _bin_offset(power, 0) == 0.0
 
 
-def test_a_limit_that_no_sample_reaches_is_not_has_influence(tmp_path):
+def test_a_limit_that_no_sample_reaches_has_no_influence(tmp_path):
     """Its column is the residual itself, faintly: at length one it would whiten the missing effect away."""
     hidden = machines.emps_like(3, 1.0, 6.0).with_effect("quadratic_drag", coefficient=800.0)
     search = start_search(opened(tmp_path, hidden))[1]
@@ -237,7 +237,7 @@ def test_a_limit_that_no_sample_reaches_is_not_has_influence(tmp_path):
     far = dataclasses.replace(saturation, starts=np.array([1.2 * saturation.starts[0]]))
     near = dataclasses.replace(saturation, starts=np.array([0.7 * saturation.starts[0]]))
     felt = [
-        _has_influence(*cand.points(search.superset, [c], search.samples, search.theta, e), counts, scale)
+        has_influence(*cand.points(search.superset, [c], search.samples, search.theta, e), counts, scale)
         for c in (far, near)
     ]
     assert felt == [False, True]
