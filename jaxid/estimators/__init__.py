@@ -91,7 +91,11 @@ def _output_error(
     logs = parts_of(session) if session.more else log
     result = yield from output_error_steps(session.machine, logs, start=start, **options)
     result = replace(result, notes=(*result.notes, *_doubts_of_output_error(session)))
-    if start is None or session.more or all(log.measured):
+    if all(log.measured) and not session.more:
+        from jaxid.estimators.faster_loop import with_loop_of_log
+
+        return (yield from with_loop_of_log(session, result, **options))
+    if start is None or session.more:
         return result
     # Without an encoder on every joint inverse dynamics may end far off, especially with coarse readings.
     other = yield from output_error_steps(session.machine, log, **options)

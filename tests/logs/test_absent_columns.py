@@ -237,11 +237,14 @@ def test_a_drive_that_measures_its_velocity():
     case = tomllib.loads((FIELD / "slow_log.toml").read_text())
     case["controller"]["derivative"] = "velocity"
     plain = identify(case, FIELD / "slow_log.csv")
-    assert any("drive measures its velocity" in f.what for f in plain.session.findings)
+    assert any("drive measures the velocity" in f.what for f in plain.session.findings)
+    assert plain.settings["loop_velocity"]["value"] == "measured"
+    assert abs(plain.estimate.theta[0] / 0.03 - 1) < 0.003, plain.estimate.theta
     case["log"]["loop_velocity"] = "dq"
     result = identify(case, FIELD / "slow_log.csv")
     assert abs(result.estimate.theta[0] / 0.03 - 1) < 0.003, result.estimate.theta
-    assert not any("drive measures its velocity" in f.what for f in result.session.findings)
+    assert not any("drive measures the velocity" in f.what for f in result.session.findings)
+    assert "loop_velocity" not in result.settings
 
 
 def test_a_wrong_log_is_status_two(tmp_path, capsys):
