@@ -138,6 +138,11 @@ def _doubts_of_output_error(session: Session) -> list[str]:
 
     machine, log = session.machine, session.fit.log
     if machine.controller is None:
+        if any(type(e).opens_spring for e in machine.plant.effects):
+            return [
+                "an open-loop simulation hangs on every impact in a clearance: the fit may end at a local "
+                "optimum, many standard deviations off"
+            ]
         noise = force_noise(machine, session.fit.data)
         if np.any(noise > 1e-3 * np.std(log.force, axis=0)):
             return [
