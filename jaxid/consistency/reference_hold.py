@@ -22,7 +22,7 @@ from jaxid.simulation.force_balance import ForceData, measured_force
 _EXPLAINS = 1.5
 # The law is right if its command leaves at most this part of the gap of the logged one, and of the force.
 _HALF, _LEFT = 0.5, 0.05
-# Reason of a hold that the forces do not decide; the comparison's own follows.
+# Reason of a hold that the forces do not decide; that of the comparison follows.
 UNDECIDED = "the default; the forces do not decide it"
 # Forces under two holds that differ by less than this part of the measured one have the same effect.
 _SAME = 1e-3

@@ -84,7 +84,7 @@ def with_loop_of_log(session: Session, estimate: Estimate, **options: Any) -> St
 
 
 def _open_loops(session: Session) -> dict[tuple[tuple[str, str], ...], Machine]:
-    """Return the machines that a case leaves open by their settings, the session's own first."""
+    """Return the machines that a case leaves open by their settings, that of the session first."""
     machine, log = session.machine, session.fit.log
     if machine.controller is None or not all(log.measured) or log.reference is None:
         return {(): machine}
