@@ -160,12 +160,12 @@ class Gap:
 def gaps(machine: Machine, runs: Sequence[OpenedLog]) -> tuple[Gap, ...]:
     """Compute the gap of a machine on each log."""
     return tuple(
-        Gap(r.name, force_gap(r.machine(machine), r.data), _simulation_gap_of(r.machine(machine), r.log))
+        Gap(r.name, force_gap(r.machine(machine), r.data), simulation_of_log(r.machine(machine), r.log))
         for r in runs
     )
 
 
-def _simulation_gap_of(machine: Machine, log: Log) -> SimulationGap | None:
+def simulation_of_log(machine: Machine, log: Log) -> SimulationGap | None:
     """Simulate a log; in a loop, also from rest if the error of the start shows, and return the smaller gap.
 
     The start's velocity is that of a parabola through the first readings, which is wrong if a log begins with

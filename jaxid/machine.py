@@ -62,6 +62,10 @@ class Machine:
         """Check that a log holds no force although a controller drives the machine."""
         return self.controller is not None and log.passive
 
+    def ticks_between_rows(self, log: Log) -> bool:
+        """Check that the loop computes commands between the rows of a log."""
+        return self.controller is not None and log.period > 1.5 * self.controller.period
+
     def unit(self, quantity: str, joint: int = 0) -> str:
         """Return the unit of a quantity at a joint.
 

@@ -193,6 +193,30 @@ def without_scale(machine: Machine, log: Log) -> list[str]:
     return [f.name for f in forces] if sizes[0] <= _ROUNDING * sizes[1] else []
 
 
+def known_forces(machine: Machine) -> list[str]:
+    """Return the known values in proportion to which forces act, each as name, value and unit.
+
+    A free motion gives all others relative to them.
+    """
+    plant, unknown = machine.plant, set(machine.parameters.places)
+    owners: list[tuple[str, object, tuple[str | int, ...]]] = [("", plant, ())]
+    owners += [(f"{label(plant, e.kind, e.port)}.", e, ("effects", k)) for k, e in enumerate(plant.effects)]
+    out = []
+    for prefix, owner, before in owners:
+        for name, info in parameters_of(type(owner)).items():
+            value = getattr(owner, name)
+            if value is None or not carries_force(info) or np.ndim(value) > 1:
+                continue
+            for index, number in enumerate(np.atleast_1d(np.asarray(value, float)).tolist()):
+                at = None if np.ndim(value) == 0 else index
+                if number == 0 or ((*before, name), at) in unknown:
+                    continue
+                place = "" if at is None else f"[{index + 1}]"
+                unit = machine.units.label(info.dimension, info.motion or plant.motion(index))
+                out.append(f"{prefix}{name}{place} = {number:.4g} {unit}")
+    return out
+
+
 def _is_force(plant: Plant, free: Free) -> bool:
     """Check that a force is in proportion to an unknown."""
     owner = plant if free.effect is None else plant.effects[free.effect]

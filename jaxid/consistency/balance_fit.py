@@ -196,7 +196,7 @@ def _potential(machine: Machine, data: Prepared) -> np.ndarray:
 def _scales(force: np.ndarray, potential: np.ndarray, model: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return the RMS of the force of each joint without its part that depends on the position only.
 
-    A passive joint has no force of its own: the largest term of the model at the guess stands for it.
+    No force drives a passive joint: the largest term of the model at the guess stands for it.
     """
     out = np.ones(force.shape[1])
     for j in range(len(out)):

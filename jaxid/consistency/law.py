@@ -197,32 +197,69 @@ def law_findings(
     return findings
 
 
-def loop_velocity_findings(machine: Machine, log: Log) -> list[Finding]:
-    """Say what it means if a drive in a loop faster than its log measures its velocity itself.
+def mass_of_late_velocity(machine: Machine, log: Log) -> float | None:
+    """Return the mass by which a loop with a measured velocity differs from one that differences positions.
 
     A differenced position is half of its window late, which acts like a mass. Between the samples of a slow
     log the command does not show which of the two the loop uses.
+
+    Args:
+        machine: The machine at its guesses, with its controller.
+        log: The log.
+
+    Returns:
+        The mass [kg or kg m^2]; None if it is a negligible part of the inertia, if the case states how the
+        loop has its velocity, or if the log has a row for every tick.
     """
     controller, inertia = machine.controller, machine.plant.own_inertia()
     if not isinstance(controller, CascadePD | PD | PID) or controller.own_velocity or inertia is None:
-        return []
+        return None
     if log.reference is None or round(log.period / controller.period) <= 1:
-        return []
+        return None
     if controller.velocity_average > 1:
         # The case states how positions are differenced.
-        return []
+        return None
     damping = np.asarray(controller.kv if isinstance(controller, CascadePD) else controller.kd)
     late = 0.5 * controller.period * controller.velocity_average
-    mass = np.max(np.abs(damping * machine.gain) * late)
-    part = float(mass / np.max(np.asarray(inertia)))
-    if part < _SEEN:
+    mass = float(np.max(np.abs(damping * machine.gain) * late))
+    return mass if mass >= _SEEN * float(np.max(np.asarray(inertia))) else None
+
+
+def loop_velocity_findings(machine: Machine, log: Log) -> list[Finding]:
+    """Say that a loop may difference positions or take a velocity that its drive measures."""
+    mass, inertia = mass_of_late_velocity(machine, log), machine.plant.own_inertia()
+    if mass is None:
         return []
+    part = mass / float(np.max(np.asarray(inertia)))
     what = (
-        f"the loop is taken to difference positions; if the drive measures its velocity itself, the inertia "
-        f"is {mass:.2g} {machine.unit('inertia')} smaller than the fit says, {100 * part:.2g} % of the guess"
+        "the case does not state whether the loop differences positions or its drive measures the velocity: "
+        f"they differ by {mass:.2g} {machine.unit('inertia')} of inertia, {100 * part:.2g} % of the guess; "
+        "output_error of one log fits both, and takes the one that explains the command"
     )
-    hint = "name the column of that velocity as loop_velocity in [log], if so"
+    hint = "name the column of that velocity as loop_velocity in [log], or state velocity_average"
     return [Finding("warning", what, f"{log.source}, [controller]", hint)]
+
+
+def law_of_rows(machine: Machine, log: Log) -> str | None:
+    """Return the law of reference, position and measured velocity that gives the logged force of each row.
+
+    Args:
+        machine: A machine without a controller, of one driven joint.
+        log: The log.
+
+    Returns:
+        The law as a case would state it; None if the log lacks reference or velocity, or no such law
+        reproduces the force.
+    """
+    if log.reference is None or log.velocity is None or log.force.shape[1] != 1 or not all(log.measured):
+        return None
+    (joint,) = machine.plant.driven(log.position.shape[1])
+    rows = np.stack([log.reference[:, 0] - log.position[:, joint], -log.velocity[:, joint]], axis=1)
+    gains = np.linalg.lstsq(rows, log.force[:, 0], rcond=1e-12)[0]
+    left = np.linalg.norm(log.force[:, 0] - rows @ gains) / max(np.linalg.norm(log.force), 1e-300)
+    if not left < _EXACT or not np.all(gains > 0):
+        return None
+    return f"kind = 'pd' with derivative = 'velocity', kp = {gains[0]:.4g}, kd = {gains[1]:.4g}"
 
 
 def _best_law(machine: Machine, log: Log, drive: int) -> _Fitted | None:

@@ -22,6 +22,8 @@ from jaxid.simulation.force_balance import ForceData, measured_force
 _EXPLAINS = 1.5
 # The law is right if its command leaves at most this part of the gap of the logged one, and of the force.
 _HALF, _LEFT = 0.5, 0.05
+# Reason of a hold that the forces do not decide; that of the comparison follows.
+UNDECIDED = "the default; the forces do not decide it"
 # Forces under two holds that differ by less than this part of the measured one have the same effect.
 _SAME = 1e-3
 
@@ -143,7 +145,10 @@ def reference_hold_finding(
     if best is None:
         if stated or not compared.matters:
             return []
-        what = f"reference_hold is not stated, and cannot be decided: {compared.reason}; '{hold}' is used"
+        what = (
+            f"reference_hold is not stated, and cannot be decided: {compared.reason}; '{hold}' is used, but "
+            "output_error of one log fits each and takes the one that explains it"
+        )
         hint = "state reference_hold in [log]: 'zero_order' if a target is kept until the next row"
         return [Finding("warning", what, where, hint)]
     if best == hold:
@@ -173,7 +178,7 @@ def reference_hold_setting(compared: ReferenceHold, hold: str, unit: str, *, sta
     if stated:
         return {"value": hold, "reason": "the case states it"}
     if compared.best is None:
-        return {"value": hold, "reason": f"the default; the log does not decide it: {compared.reason}"}
+        return {"value": hold, "reason": f"{UNDECIDED}: {compared.reason}"}
     others = ", ".join(f"'{h}' {gap:.3g} {unit}" for h, gap in compared.gaps.items() if h != hold)
     reason = f"the declared law then leaves a force gap of {compared.gaps[hold]:.3g} {unit}"
     return {"value": hold, "reason": f"{reason}; with {others}"}

@@ -71,7 +71,7 @@ def choose_method(session: Session, asked: str | None = None, *, curvature: bool
     breaks_away = any(e.break_away_level is not None for e in plant.effects)
     if breaks_away and looped:
         return Choice("output_error", "only a simulated loop shows when a joint breaks away")
-    if controller is not None and looped and log.period > 1.5 * controller.period:
+    if looped and machine.ticks_between_rows(log):
         return Choice(
             "output_error", "the log is slower than the loop, whose command changes between samples"
         )

@@ -65,7 +65,7 @@ class Likelihood:
 
     def sticks_surely(self, noise: np.ndarray) -> bool:
         """Check that there is so little noise of the force that it is known when a joint sticks."""
-        if self.slow is None or self.applied is None:
+        if self.slow is None:
             return False
         return bool(np.all(np.exp(noise[: len(self.force)]) < _QUIET * self.force))
 

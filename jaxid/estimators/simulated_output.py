@@ -201,6 +201,9 @@ def turning_steps(machine: Machine, log: Log) -> int:
     if inertia is None or not np.any(noise > 0):
         return 1
     period = machine.controller.period if machine.controller is not None else log.period
+    if machine.ticks_between_rows(log):
+        # The highest frequencies of a slow log are motion: its noise is not known from them.
+        return _MOST
     # Noise of a velocity moves an integrated position by as much in one sample.
     noise = noise * log.period if log.integrated else noise
     n = log.position.shape[1]

@@ -26,3 +26,24 @@ def shifted(signal: Float[Array, "time m"], shift: Array, ahead: int = 0) -> Flo
         return jnp.take_along_axis(signal, jnp.clip(k, 0, samples - 1), axis=0)
 
     return (1 - part) * value(at) + part * value(at - 1)
+
+
+def shifted_hold(signal: Float[Array, "time m"], shift: Array) -> tuple[Array, Array]:
+    """Delay a signal that is held from sample to sample; return a line's values at the ends of each interval.
+
+    With a part of a sample in the delay, the older value acts for that part of the interval and the newer one
+    for the rest. The line has the same mean and the same first moment, so that a mass moves as under the two
+    values, in velocity and position.
+
+    Args:
+        signal: Values at the samples, (time, m).
+        shift: Delay in samples, not negative, one for all columns or one each.
+
+    Returns:
+        Values at the starts and at the ends of the intervals, (time, m) each.
+    """
+    mean = shifted(signal, shift)
+    part = shift - jnp.floor(shift)
+    newer, older = (shifted(signal, jnp.floor(shift) + k) for k in (0, 1))
+    lean = 3.0 * part * (1.0 - part) * (newer - older)
+    return mean - lean, mean + lean

@@ -22,7 +22,7 @@ from jaxid.logs.soundness import position_levels
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics.filters import high_band_std
-from jaxid.simulation.loops import Drive, interval_forces
+from jaxid.simulation.loops import Drive, interval_forces, stays_held
 from jaxid.simulation.replay import Numerics, make_replay
 from jaxid.simulation.sensor_noise import position_noise
 
@@ -80,7 +80,7 @@ class KalmanFilter(eqx.Module):
         # The state begins with the positions, which the velocities follow.
         first = n if self.of_velocity else 0
         before, after = interval_forces(plant, drive, self.command)
-        held = drive.hold == "zero_order"
+        held = stays_held(plant, drive)
 
         x0 = State(self.start[:n], self.start[n:], plant.initial_states(before[0]))
         x, unravel = ravel_pytree(x0)

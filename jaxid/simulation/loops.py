@@ -22,7 +22,7 @@ from jaxid.controllers import Controller, Tick
 from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, step, vector_field
 from jaxid.model.plant import Plant
-from jaxid.numerics.delays import shifted
+from jaxid.numerics.delays import shifted, shifted_hold
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.solvers import RELATIVE, AdaptiveStep
 
@@ -143,7 +143,7 @@ def open_loop(
     before, after = (f[earlier:] for f in interval_forces(plant, drive, known))
     times = start + drive.period * jnp.arange(command.shape[0])
     x0 = State(position, velocity, plant.initial_states(before[0]) if own is None else own)
-    held = drive.hold == "zero_order"
+    held = stays_held(plant, drive)
     advance = drive.stepper(plant, x0, (before[0],) if held else (before[0], after[0]))
     n = command.shape[0]
     flag, q_new, v_new = (
@@ -164,15 +164,22 @@ def open_loop(
 def interval_forces(plant: Plant, drive: Drive, command: Float[Array, "time m"]) -> tuple[Array, Array]:
     """Return the declared force at the start and the end of every interval, delay applied.
 
-    A fractional delay is averaged over the interval. An exact treatment would give a held command a zero
-    gradient with respect to the delay.
+    In an interval with a change of a held command, a line has the same mean and first moment, see
+    `shifted_hold`.
     """
     force = drive.gain * command
     shift = plant.command_delays(force.shape[1]) / drive.period
-    start = shifted(force, shift)
-    if drive.hold == "zero_order":
+    if stays_held(plant, drive):
+        start = shifted(force, shift)
         return start, start
-    return start, shifted(force, shift, ahead=1)
+    if drive.hold == "zero_order":
+        return shifted_hold(force, shift)
+    return shifted(force, shift), shifted(force, shift, ahead=1)
+
+
+def stays_held(plant: Plant, drive: Drive) -> bool:
+    """Check that the force is constant between two samples: its command is held, and nothing delays it."""
+    return drive.hold == "zero_order" and not any(e.delays_command() for e in plant.effects)
 
 
 def closed_loop(
@@ -213,7 +220,7 @@ def closed_loop(
     held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
     past = jnp.broadcast_to(held, (drive.longest_delay + 1, held.size))
     x0 = State(position, velocity, plant.initial_states(held))
-    advance = drive.stepper(plant, x0, (held,))
+    advance = drive.stepper(plant, x0, (held,) if drive.longest_delay == 0 else (held, held))
 
     inertial, m = sensor.inertial, drive.gain.size
 
@@ -239,8 +246,8 @@ def closed_loop(
             (v, a, renewed), moved = sensed(x, reading, moved, more, renews)
         seen = Tick(reading, path, driven, True if fresh is None else fresh, v, a, last, renewed)
         u, memory = controller.command(seen, memory, disturbance)
-        force, past = _delayed_force(plant, drive, u, past)
-        new = advance(x, (force,), t)
+        ends, past = _delayed_force(plant, drive, u, past)
+        new = advance(x, ends, t)
         if last is not None:
             assert noise is not None, "a command is measured only with noise"
             last = sensor.read_command(u, noise[n : n + m])
@@ -256,17 +263,22 @@ def closed_loop(
     return Trajectory(q, v, u, reading, found)
 
 
-def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[Array, Array]:
-    """Return the declared force over the coming interval, and the updated memory of past ones."""
+def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[tuple[Array, ...], Array]:
+    """Return the declared force at the ends of the coming interval, and the updated memory of past ones.
+
+    A force that is constant over the interval is given once; else see `shifted_hold`.
+    """
     force = drive.gain * u
     if drive.longest_delay == 0:
-        return force, past
+        return (force,), past
     past = jnp.concatenate([force[None], past[:-1]])
     shift = jnp.clip(plant.command_delays(u.size) / drive.period, 0.0, drive.longest_delay)
     # Hat weights over the last samples: linear interpolation without a data-dependent index.
-    samples = jnp.arange(drive.longest_delay + 1)[:, None]
-    weight = jnp.maximum(0.0, 1.0 - jnp.abs(samples - shift))
-    return jnp.sum(weight * past, axis=0), past
+    away = jnp.arange(drive.longest_delay + 1)[:, None] - shift
+    hat = jnp.maximum(0.0, 1.0 - jnp.abs(away))
+    mean = jnp.sum(hat * past, axis=0)
+    lean = jnp.sum(-3.0 * away * hat * past, axis=0)
+    return (mean - lean, mean + lean), past
 
 
 def initial_state(

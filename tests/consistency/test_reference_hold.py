@@ -104,7 +104,7 @@ def test_a_reference_at_rest_decides_nothing_and_says_nothing(logs):
         case() | {"controller": case()["controller"] | {"disturbance": still.disturbance}}, log
     )
     assert session.machine.reference_hold == "band_limited"
-    assert "does not decide" in session.settings["reference_hold"]["reason"]
+    assert "do not decide" in session.settings["reference_hold"]["reason"]
     assert said(session) == []
 
 
@@ -142,7 +142,7 @@ def test_a_loop_may_use_a_velocity_that_its_drive_measures():
     controller = dataclasses.replace(session.machine.controller, velocity_average=1)
     machine = dataclasses.replace(session.machine, controller=controller)
     (finding,) = loop_velocity_findings(machine, session.fit.log)
-    assert finding.what.startswith("the loop is taken to difference positions")
+    assert finding.what.startswith("the case does not state whether the loop differences positions")
     assert loop_velocity_findings(session.machine, session.fit.log) == []
 
 

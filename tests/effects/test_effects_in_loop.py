@@ -111,12 +111,12 @@ def distance(name: str, substeps: int) -> float:
 
 
 # Of the stroke. Dry friction turns exactly within a step where its level is constant; one that moves with
-# speed is taken halfway (second order), one that drifts at the step's start (first). A delay off the
-# grid is averaged over a tick (second order in it). |v| is rounded over 1 mm/s, the corners of the limit by
-# voltage, which speed crosses within a tick, over a thousandth of it. All else is smooth: the stepper's
-# second order at 5 us.
+# speed is taken halfway (second order), one that drifts at the step's start (first). Under a delay off the
+# grid a line stands in a tick for two values (third order in it). |v| is rounded over 1 mm/s, the corners of
+# the limit by voltage, which speed crosses within a tick, over a thousandth of it. All else is smooth: the
+# stepper's second order at 5 us.
 CLOSE = {
-    "input_delay": 1e-5,
+    "input_delay": 1e-6,
     "asymmetric_viscous": 1e-6,
     "hysteresis": 1e-6,
     "quadratic_drag": 2e-9,

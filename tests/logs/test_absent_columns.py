@@ -10,8 +10,10 @@ import pytest
 from jaxid.cli import main
 from jaxid.commands.discover import discover
 from jaxid.commands.identify import identify, identify_many
+from jaxid.consistency.absent import known_forces
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
+from jaxid.session import open_session
 from truth.axis.machines import Loop, Machine, Sensor, Setup, multisine
 
 MEASURED = os.environ.get("JAXID_DATA")
@@ -188,6 +190,11 @@ def test_a_free_swing_on_a_known_spring(sensor):
     assert np.all(estimates[0].std / [0.5, 0.3, 0.4] < 0.01)
 
 
+def test_the_known_value_that_scales_a_swing_is_named():
+    session = open_session(case_of(SWUNG, [*FRICTION, SPRING]), swing(0))
+    assert known_forces(session.machine) == ["linear_stiffness.coefficient = 200 N m/rad"]
+
+
 def test_a_swing_without_scale_is_refused():
     free = {"kind": "linear_stiffness", "coefficient": {"guess": 150.0}}
     with pytest.raises(InputError, match="'force' is missing, and nothing known acts: inertia, ") as told:
@@ -207,7 +214,9 @@ def test_field_swings_of_a_pendulum(name):
     case = tomllib.loads((FIELD / "swing.toml").read_text())
     if "no" in name:
         del case["log"]["force"]
-    estimate = identify(case, FIELD / name).estimate
+    result = identify(case, FIELD / name)
+    estimate = result.estimate
+    assert "all values are in proportion to first_moment_x[1] = 0.00214 kg m" in result.findings[0]
     # The case rounds the moment of the weight: 0.00214 g is 0.9997 of the true 0.021 N m.
     inside(estimate, np.array([1.9e-4, 3e-5, 4e-4]) * 0.00214 * 9.81 / 0.021)
 
@@ -237,11 +246,14 @@ def test_a_drive_that_measures_its_velocity():
     case = tomllib.loads((FIELD / "slow_log.toml").read_text())
     case["controller"]["derivative"] = "velocity"
     plain = identify(case, FIELD / "slow_log.csv")
-    assert any("drive measures its velocity" in f.what for f in plain.session.findings)
+    assert any("drive measures the velocity" in f.what for f in plain.session.findings)
+    assert plain.settings["loop_velocity"]["value"] == "measured"
+    assert abs(plain.estimate.theta[0] / 0.03 - 1) < 0.003, plain.estimate.theta
     case["log"]["loop_velocity"] = "dq"
     result = identify(case, FIELD / "slow_log.csv")
     assert abs(result.estimate.theta[0] / 0.03 - 1) < 0.003, result.estimate.theta
-    assert not any("drive measures its velocity" in f.what for f in result.session.findings)
+    assert not any("drive measures the velocity" in f.what for f in result.session.findings)
+    assert "loop_velocity" not in result.settings
 
 
 def test_a_wrong_log_is_status_two(tmp_path, capsys):

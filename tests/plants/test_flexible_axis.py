@@ -14,7 +14,7 @@ from jaxid.case.case import load_case
 from jaxid.cli import main
 from jaxid.dynamics.hidden_joints import complete_motion
 from jaxid.errors import InputError
-from jaxid.estimators import METHODS
+from jaxid.estimators import METHODS, _doubts_of_output_error
 from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.logs.log import Log
 from jaxid.numerics.lanes import run_alone
@@ -223,6 +223,21 @@ def test_faults_are_one_line(folder, tmp_path, name):
     text = str(error.value)
     assert "\n" not in text
     assert all(part in text for part in told), text
+
+
+def test_an_open_loop_with_a_clearance_is_doubted(tmp_path, folder):
+    """Over 2.5 s its simulation parts from the exact chain by 0.1 to 0.5 mm, whatever corner and steps."""
+    text = axes.text()
+    open_loop = text[: text.index("[controller]")] + text[text.index("[sensor]") :]
+    open_loop = open_loop.replace('reference = "ref"\n', "")
+    spring = '[[effects]]\nkind = "backlash"\nspring = 1\ngap = { guess = 3e-4 }\n'
+    said = []
+    for case in (open_loop, open_loop.replace("[actuator]", spring + "[actuator]")):
+        (tmp_path / "case.toml").write_text(case)
+        session = open_session(tmp_path / "case.toml", folder / "log.csv")
+        said.append(" ".join(_doubts_of_output_error(session)))
+    assert "clearance" not in said[0]
+    assert "hangs on every impact in a clearance" in said[1]
 
 
 def test_backlash_needs_a_spring(tmp_path):

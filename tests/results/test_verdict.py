@@ -179,6 +179,9 @@ def changed(result, name, value, std=None):
         ("inertia", 1.2e6, 1.0, "times above its guess", False),
         ("inertia", 20000.0, 100000.0, "exceeds the value", True),
         ("coulomb_friction.level", 0.0, 1.0, "is at its lower bound, 0", True),
+        ("coulomb_friction.level", -5.0, 1.0, "is negative, which no machine is", False),
+        ("coulomb_friction.level", -5.0, 2.5, "is negative, which no machine is: the log does not", False),
+        ("coulomb_friction.level", -5.0, 10.0, "is negative, which no machine is: the log does not", True),
     ],
 )
 def test_values_in_words(missing, name, value, std, told, explains):

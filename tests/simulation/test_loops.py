@@ -11,6 +11,7 @@ from jaxid.controllers.linear import CascadePD
 from jaxid.effects import EFFECTS
 from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.delays import shifted_hold
 from jaxid.plants import Axis
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.loops import (
@@ -118,12 +119,22 @@ def delayed_forces(hold: str):
     return [np.asarray(x)[4:, 0] for x in both]
 
 
-def test_held_and_delayed_force_is_its_mean_over_each_interval():
+def test_held_and_delayed_force_has_mean_and_moment_of_each_interval():
+    """A mass then moves as under the two values that act in turn."""
     start, end = delayed_forces("zero_order")
     late = PERIOD * (np.arange(SAMPLES * 1000) + 0.5) / 1000 - DELAY
     held = COMMAND[np.clip(np.floor(late / PERIOD).astype(int), 0, None)]
-    mean = 3.0 * held.reshape(SAMPLES, 1000).mean(axis=1)
-    np.testing.assert_allclose(start, mean[4:], atol=1e-12)
+    acting = 3.0 * held.reshape(SAMPLES, 1000)[4:]
+    np.testing.assert_allclose(0.5 * (start + end), acting.mean(axis=1), atol=1e-12)
+    moment = acting @ ((np.arange(1000) + 0.5) / 1000 - 0.5) / 1000
+    # Of a line from start to end: a twelfth of its rise. The sum over a thousand parts is off by 1e-6 of it.
+    np.testing.assert_allclose((end - start) / 12, moment, atol=1e-5 * np.abs(moment).max())
+
+
+def test_a_delay_of_whole_samples_leaves_the_command_held():
+    signal = jnp.asarray(COMMAND)[:, None]
+    start, end = shifted_hold(signal, jnp.asarray(2.0))
+    np.testing.assert_array_equal(np.asarray(start)[2:], COMMAND[:-2, None])
     np.testing.assert_array_equal(end, start)
 
 

@@ -1,1 +1,1 @@
-"""Estimators that fit one set of unknowns to several logs, each log weighed by its own noise."""
+"""Estimators that fit one set of unknowns to several logs, each log weighed by its noise."""

@@ -140,7 +140,7 @@ class _SimulatedLogs:
 class _SummaryStatistics:
     """Summary statistics of a log: the Gauss-Newton step of the fit along its directions.
 
-    The initial position within its first count is no unknown here, because each simulated log has its own:
+    The initial position within its first count is no unknown here, because each log has another one:
     as an unknown it would count twice, and could go beyond that count.
 
     Args:

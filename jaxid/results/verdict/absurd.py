@@ -23,7 +23,9 @@ _NOTHING = 1e-3
 _AT_BOUND = 1e-6
 # Standard deviations by which an inertia must be below the least one that is possible.
 _SIGMAS = 3.0
-# Parameters of a link that enter its inertia about the axis of its joint.
+# The inertia of a link about the axis of its joint; further links only add to it.
+_ABOUT_AXIS = "inertia_zz"
+# Parameters of a link that enter that inertia.
 _AXIAL = ("mass", "first_moment_x", "first_moment_y", "inertia_zz")
 
 
@@ -59,7 +61,8 @@ def remarks_on(session: Session, estimate: Estimate) -> list[Remark]:
             continue
         value, std, info = float(estimate.theta[k]), float(estimate.std[k]), _info(estimate.machine.plant, f)
         remark = (
-            _too_fine(session, f, value, info)
+            _negative(f, value, std, info)
+            or _too_fine(session, f, value, info)
             or _too_light(f, value, known, info)
             or (f.name in declared and _at_bound(declared[f.name], value, *bounds[f.name]))
             or (f.name in declared and _far_off(declared[f.name], value))
@@ -86,6 +89,18 @@ def _info(plant: Plant, f: Free) -> ParameterInfo | None:
 
 def _with_unit(value: float, unit: str) -> str:
     return f"{plain(value)} {pretty_unit(unit)}".strip()
+
+
+def _negative(f: Free, value: float, std: float, info: ParameterInfo | None) -> Remark | None:
+    """Question a negative friction, or a negative inertia about the axis of a joint."""
+    about_axis = info is not None and info.dimension == "inertia" and f.path[-1] == _ABOUT_AXIS
+    if value >= 0 or not (f.sign != "free" or about_axis):
+        return None
+    shown = f"{f.name} = {' ± '.join(with_std(value, std))} {pretty_unit(f.unit)}".strip()
+    if value + _SIGMAS * std >= 0:
+        text = f"{shown} is negative, which no machine is: the log does not determine it"
+        return Remark(f.name, text, impossible=value + std < 0)
+    return Remark(f.name, f"{shown} is negative, which no machine is", impossible=True, contradicts=True)
 
 
 def _too_fine(session: Session, f: Free, value: float, info: ParameterInfo | None) -> Remark | None:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxid.consistency.absent import known_forces
+from jaxid.consistency.law import law_of_rows
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import Gap
 from jaxid.machine import Machine
@@ -79,7 +81,8 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
 
     contrary = [r for r in remarks if r.contradicts and r not in impossible]
 
-    findings = [] if estimate.converged else [f"The fit did not converge: {estimate.message}."]
+    findings = _scale_words(session)
+    findings += [] if estimate.converged else [f"The fit did not converge: {estimate.message}."]
     findings += [f"The fit contradicts the case: {r.text}." for r in contrary]
     if against:
         findings.append(f"This model does not explain the log: {against[0]}")
@@ -100,9 +103,28 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
     return Judgement(complete, not against, identified, tuple(findings), bool(drifted), residuals)
 
 
+def _scale_words(session: Session) -> list[str]:
+    """Return a sentence on the known value that gives a free swing its scale, which the log cannot check."""
+    machine, log = session.machine, session.fit.log
+    if not log.passive or machine.controller is not None or session.more:
+        return []
+    known = known_forces(machine)
+    if not known:
+        return []
+    listed = ", ".join(known[:_MOST])
+    return [
+        f"Nothing drives the machine, so all values are in proportion to {listed}, which the log cannot "
+        "check: of an assumption only their ratios hold."
+    ]
+
+
 def _residuals(machine: Machine, run: OpenedLog, gap: Gap, *, fitted: bool) -> list[Residual]:
-    """Compare what a model leaves of a log with the noise: of the force, or of the position of a loop."""
-    if machine.unforced(run.log):
+    """Compare what a model leaves of a log with the noise: of the force, or of the position of a loop.
+
+    The force of a log slower than its loop is known at the rows only.
+    """
+    slow = run.log.reference is not None and machine.ticks_between_rows(run.log)
+    if machine.unforced(run.log) or slow:
         return position_residuals(machine, run, gap.simulation, fitted=fitted)
     return residuals_of(machine, run, gap.force, fitted=fitted)
 
@@ -208,9 +230,24 @@ def _completeness_words(
         "The standard deviations count noise only: the values are those that fit best in this model, and the "
         "machine's may differ by more."
     )
+    lines += _loop_words(session)
     if search == "none":
         lines.append("The command jaxid discover searches for what is missing.")
     return lines
+
+
+def _loop_words(session: Session) -> list[str]:
+    """Return a sentence on a loop that is not declared and may be faster than its log."""
+    machine, log = session.machine, session.fit.log
+    if machine.controller is not None or log.reference is None or log.steady is not None:
+        return []
+    law = law_of_rows(machine, log)
+    named = f" (its rows are those of {law})" if law else ""
+    return [
+        f"The log has a reference, and the case no [controller]{named}: if the loop is faster than the "
+        f"{plain(log.rate_hz)} Hz of the log, its force changes between the rows, and only a declared loop "
+        "with its period gives it."
+    ]
 
 
 def _severity(r: Residual) -> float:
