@@ -109,6 +109,8 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
         load = round(os.getloadavg()[0], 1)
         rows.append(Row(what, group, float(wall), float(processor), len(seconds), int(status), load, of))
         print(line_of(rows[-1]), flush=True)
+        if not options.no_write:
+            write_down(kept_rows(rows) if only else rows)
 
     with tempfile.TemporaryDirectory() as room:
         for what, (group, words) in quickly_ended(Path(room)).items():
@@ -143,12 +145,11 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
             add(what, "discover first", [(*map(float, middle), int(status))], of)
     if options.long and only in "discover long":
         for what, write in long_searches().items():
-            for of, root in trees.items():
-                with tempfile.TemporaryDirectory() as room:
-                    words = write(Path(room))
-                    if words:
-                        seconds = timed(words, Path(room), SEARCH if "no refit" in what else COMMAND, root)
-                        add(f"discover, {what}", "long", [seconds], of)
+            with tempfile.TemporaryDirectory() as room:
+                words = write(Path(room))
+                if words:
+                    code = SEARCH if "no refit" in what else COMMAND
+                    add(f"discover, {what}", "long", [timed(words, Path(room), code)])
     return rows
 
 
@@ -224,8 +225,8 @@ def kept_rows(rows: list[Row]) -> list[Row]:
         return rows
     before = json.loads(path.read_text())
     old = [Row(**{"load": None, "commit": before.get("commit", ""), **row}) for row in before["rows"]]
-    new = {(row.what, row.commit) for row in rows} | {(row.what, before.get("commit")) for row in rows}
-    return [row for row in old if (row.what, row.commit) not in new] + rows
+    new = {row.what for row in rows}
+    return [row for row in old if row.what not in new] + rows
 
 
 def report(rows: list[Row], seen: dict[str, str | int]) -> str:
@@ -243,6 +244,14 @@ def report(rows: list[Row], seen: dict[str, str | int]) -> str:
     )  # fmt: skip
 
 
+def write_down(rows: list[Row]) -> None:
+    """Write the table; after each row, so that a run that is cut short leaves what it has measured."""
+    seen = origin()
+    (HERE / "results" / "cold.md").write_text(report(rows, seen))
+    content = {**seen, "rows": [asdict(row) for row in rows]}
+    (HERE / "results" / "cold.json").write_text(json.dumps(content, indent=1) + "\n")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=3)
@@ -253,11 +262,6 @@ def main() -> int:
     parser.add_argument("--no-write", action="store_true", help="only print")
     options = parser.parse_args()
     rows = rows_of(options)
-    if not options.no_write:
-        seen, every_row = origin(), kept_rows(rows) if options.only else rows
-        (HERE / "results" / "cold.md").write_text(report(every_row, seen))
-        content = {**seen, "rows": [asdict(row) for row in every_row]}
-        (HERE / "results" / "cold.json").write_text(json.dumps(content, indent=1) + "\n")
     return 0 if all(row.aim is None or row.wall <= row.aim for row in rows) else 1
 
 
