@@ -200,9 +200,15 @@ def line_of(row: Row) -> str:
 
 
 def commit_of(root: Path) -> str:
-    """Name the commit of a working tree, with `-dirty` if it was changed."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=8", "--exclude=*"]
-    return subprocess.run(command, capture_output=True, text=True, cwd=root, check=False).stdout.strip()
+    """Name the commit of a working tree, with `-dirty` if more of it was changed than results."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", *words], capture_output=True, text=True, cwd=root, check=False
+        ).stdout.strip()
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!benchmarks/results")
+    return git("rev-parse", "--short=8", "HEAD") + ("-dirty" if changed else "")
 
 
 def origin() -> dict[str, str | int]:
