@@ -70,6 +70,8 @@ def timed(words: list[str], cache: Path, code: str = COMMAND, root: Path = ROOT)
     ran = subprocess.Popen(
         [sys.executable, "-c", code, *words],
         env=environment,
+        # Python would import the jaxid of the folder in which it starts, before that of the path.
+        cwd=cache,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -161,7 +163,7 @@ def long_searches() -> dict[str, Callable[[Path], list[str] | None]]:
         what: lambda room, name=name: ["discover", *five_bar(room, name), "--quiet"]
         for name, what in FIVE_BAR.items()
     }
-    return {**robots, "TX40, no refit": arm}
+    return {"TX40, no refit": arm, **robots}
 
 
 def first_and_again(words: list[str], repeats: int) -> tuple[list, list]:

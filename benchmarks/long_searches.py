@@ -12,7 +12,7 @@ from tests.discovery.test_five_bar_search import CASE, CASES, NOISE, SECOND
 from truth.five_bar.stepper import followed
 
 # What is hidden in the robot: friction of a passive hinge, or a payload at the tool.
-FIVE_BAR = {"coulomb": "five-bar, friction of a hinge", "payload": "five-bar, payload"}
+FIVE_BAR = {"payload": "five-bar, payload", "coulomb": "five-bar, friction of a hinge"}
 
 
 def five_bar(folder: Path, name: str) -> list[str]:

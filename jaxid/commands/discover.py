@@ -143,9 +143,11 @@ def explore(
     progress("refitting in simulation" if refit else "simulating")
     before, old = declared.result()
     after, new = before, old
+    if refitted is not None and search.model is not likely:
+        refitted.cancel()
+        refitted = None
     if effects:
-        kept = refitted is not None and search.model is likely
-        after, new = refitted.result() if kept else _with_effects(session, final, refit)
+        after, new = refitted.result() if refitted else _with_effects(session, final, refit)
     designs = session.machine.plant.designs_experiments if experiments is None else experiments
     if session.more and experiments:
         session.need_one_log("the design of experiments")
