@@ -5,7 +5,9 @@ The residual's Jacobian is the regressor: there is no other set of columns.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -97,11 +99,9 @@ def _uses_drive(effect: Effect, state: Array) -> bool:
     return depends(lambda u: effect.act(Signals(**still | {"u": u}), state).rate, (zero,))
 
 
-def _rates(plant: Plant, motion: tuple, own: tuple, values: dict[int, Array]) -> dict[int, Array]:
+def _rates(plant: Plant, motion: tuple, own: tuple, values: Mapping[int, Any]) -> dict[int, Array]:
     """Return the rates of some internal states along a motion, each state held at a value."""
-    at = tuple(
-        jnp.broadcast_to(values.get(i, z), jnp.shape(z)) if z is not None else z for i, z in enumerate(own)
-    )
+    at = tuple(jnp.broadcast_to(values[i], z.shape) if i in values else z for i, z in enumerate(own))
     return jax.vmap(lambda *now: {i: balance_of(plant, *now).rates[i] for i in values})(*motion, at)
 
 
