@@ -1,9 +1,10 @@
 """What commands cost in a fresh process: refusals, lists, `identify` on the demo, `discover` on hidden cases.
 
-    python -m benchmarks.cold [--repeats 3] [--only TEXT] [--cases 5] [--no-write]
+    python -m benchmarks.cold [--repeats 3] [--only TEXT] [--cases 5] [--long] [--no-write]
 
 *First*: nothing was compiled before; *again*: with the compiled code of the first. Prints a row each, with
 the fewest seconds of all repeats on the wall and of the processor, and writes results/cold.md and cold.json.
+With --only, the other rows stay as they were written before. `--long` adds searches that take minutes.
 """
 
 import argparse
@@ -14,22 +15,38 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.discovery import every
+from truth.hidden.bench import Case, write_files
+
 HERE = Path(__file__).parent
-DEMO = HERE.parent / "jaxid" / "demo"
+ROOT = HERE.parent
+DEMO = ROOT / "jaxid" / "demo"
 COMMAND = "from jaxid.cli import entry; entry()"
+# A search as the command runs it, but without the refit in simulation.
+SEARCH = "import sys; from jaxid import _cache; _cache.configure(); import jaxid; " + (
+    "jaxid.discover(*sys.argv[1:], refit=False)"
+)
 # Seconds: of a refusal or a list, of `identify` first and again, of the median search from cold.
-AIMS = {"refusal": 0.3, "list": 0.3, "identify first": 4.0, "identify again": 2.0, "discover first": 8.0}
+AIMS = {
+    "refusal": 0.3,
+    "list": 0.3,
+    "identify first": 4.0,
+    "identify again": 2.0,
+    "discover first": 8.0,
+    "long": 60.0,
+}
 
 
 @dataclass(frozen=True)
 class Row:
-    """One command: fewest seconds of its repeats."""
+    """One command: fewest seconds of its repeats, with the load of the machine and the commit of jaxid."""
 
     what: str
     group: str
@@ -37,20 +54,24 @@ class Row:
     processor: float
     repeats: int
     status: int
+    load: float | None
+    commit: str
 
     @property
     def aim(self) -> float | None:
         return AIMS.get(self.group)
 
 
-def timed(words: list[str], cache: Path) -> tuple[float, float, int]:
+def timed(words: list[str], cache: Path, code: str = COMMAND, root: Path = ROOT) -> tuple[float, float, int]:
     """Wall seconds, seconds of the processor, and exit status of one command."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", "XLA"))}
-    environment |= {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(HERE.parent)}
+    environment |= {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(root)}
     begin = time.perf_counter()
     ran = subprocess.Popen(
-        [sys.executable, "-c", COMMAND, *words],
+        [sys.executable, "-c", code, *words],
         env=environment,
+        # Python would import the jaxid of the folder in which it starts, before that of the path.
+        cwd=cache,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -80,14 +101,18 @@ def quickly_ended(folder: Path) -> dict[str, tuple[str, list[str]]]:
     return out
 
 
-def rows_of(repeats: int, cases: int, only: str) -> list[Row]:
+def rows_of(options: argparse.Namespace) -> list[Row]:
     """Time every command whose row is wanted."""
-    rows = []
+    rows, repeats, only = [], options.repeats, options.only
+    commit = commit_of(ROOT)
 
-    def add(what: str, group: str, seconds: list[tuple[float, float, int]]) -> None:
+    def add(what: str, group: str, seconds: list[tuple[float, float, int]], of: str = commit) -> None:
         wall, processor, status = np.min(seconds, axis=0)
-        rows.append(Row(what, group, float(wall), float(processor), len(seconds), int(status)))
+        load = round(os.getloadavg()[0], 1)
+        rows.append(Row(what, group, float(wall), float(processor), len(seconds), int(status), load, of))
         print(line_of(rows[-1]), flush=True)
+        if not options.no_write:
+            write_down(kept_rows(rows) if only else rows)
 
     with tempfile.TemporaryDirectory() as room:
         for what, (group, words) in quickly_ended(Path(room)).items():
@@ -105,15 +130,40 @@ def rows_of(repeats: int, cases: int, only: str) -> list[Row]:
             group = "identify" if what == "identify, demo" else "other"
             add(f"{what}, first", f"{group} first", first)
             add(f"{what}, again", f"{group} again", again)
+    trees = {commit: ROOT}
+    if options.against:
+        trees = {commit_of(Path(options.against)): Path(options.against), **trees}
     if only in "discover":
-        seconds = searches(cases)
-        for what, each in seconds.items():
-            add(what, "", [each])
-        if seconds:
-            middle = np.median([s[:2] for s in seconds.values()], axis=0)
-            rows.append(Row("discover, median of these", "discover first", *map(float, middle), 1, 0))
-            print(line_of(rows[-1]), flush=True)
+        found: dict[str, list] = {of: [] for of in trees}
+        for case in searched(options.cases):
+            for of, root in trees.items():
+                with tempfile.TemporaryDirectory() as room:
+                    words = [str(word) for word in write_files(case, Path(room))]
+                    found[of].append(timed(["discover", *words, "--quiet"], Path(room), root=root))
+                add(f"discover, {case.id}", "", found[of][-1:], of)
+        for of, seconds in found.items():
+            *middle, status = np.median(seconds, axis=0)
+            what = f"discover, median of {len(seconds)}"
+            add(what, "discover first", [(*map(float, middle), int(status))], of)
+    if options.long and only in "discover long":
+        for what, write in long_searches().items():
+            with tempfile.TemporaryDirectory() as room:
+                words = write(Path(room))
+                if words:
+                    code = SEARCH if "no refit" in what else COMMAND
+                    add(f"discover, {what}", "long", [timed(words, Path(room), code)])
     return rows
+
+
+def long_searches() -> dict[str, Callable[[Path], list[str] | None]]:
+    """Searches that take minutes: what they are, and how to write their files."""
+    from benchmarks.long_searches import FIVE_BAR, arm, five_bar
+
+    robots = {
+        what: lambda room, name=name: ["discover", *five_bar(room, name), "--quiet"]
+        for name, what in FIVE_BAR.items()
+    }
+    return {"TX40, no refit": arm, **robots}
 
 
 def first_and_again(words: list[str], repeats: int) -> tuple[list, list]:
@@ -127,39 +177,48 @@ def first_and_again(words: list[str], repeats: int) -> tuple[list, list]:
     return first, again
 
 
-def searches(count: int) -> dict[str, tuple[float, float, int]]:
-    """Seconds of a fresh `jaxid discover`, by case, spread over those of `benchmarks.discovery`."""
-    from benchmarks.discovery import every
-    from truth.hidden.bench import write_files
-
+def searched(count: int) -> list[Case]:
+    """Some cases of `benchmarks.discovery`, spread over all of them."""
     every_case = list(every("test", 1))
-    out = {}
-    for case in every_case[:: max(1, len(every_case) // count)][:count]:
-        with tempfile.TemporaryDirectory() as room:
-            words = [str(word) for word in write_files(case, Path(room))]
-            out[f"discover, {case.id}"] = timed(["discover", *words, "--quiet"], Path(room))
-    return out
+    return every_case[:: max(1, len(every_case) // count)][:count]
 
 
 def line_of(row: Row) -> str:
     """A row of the table in Markdown."""
     aim = "" if row.aim is None else f"{row.aim:g}"
     met = "" if row.aim is None else "yes" if row.wall <= row.aim else "**no**"
-    cells = (row.what, f"{row.wall:.2f}", f"{row.processor:.2f}", row.repeats, row.status, aim, met)
+    seconds = (f"{row.wall:.2f}", f"{row.processor:.2f}")
+    cells = (
+        row.what,
+        *seconds,
+        row.repeats,
+        row.status,
+        aim,
+        met,
+        "" if row.load is None else row.load,
+        row.commit,
+    )
     return f"| {' | '.join(map(str, cells))} |"
 
 
+def commit_of(root: Path) -> str:
+    """Name the commit of a working tree, with `-dirty` if more of it was changed than results."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", *words], capture_output=True, text=True, cwd=root, check=False
+        ).stdout.strip()
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!benchmarks/results")
+    return git("rev-parse", "--short=8", "HEAD") + ("-dirty" if changed else "")
+
+
 def origin() -> dict[str, str | int]:
-    """The commit, the machine and the versions."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty", "--abbrev=8", "--exclude=*"],
-        capture_output=True, text=True, cwd=HERE, check=False,
-    ).stdout.strip()  # fmt: skip
+    """The machine and the versions."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
-        "commit": commit,
         "processor": models[0] if models else platform.processor(),
         "cores": os.cpu_count() or 1,
         "python": platform.python_version(),
@@ -167,31 +226,50 @@ def origin() -> dict[str, str | int]:
     }
 
 
+def kept_rows(rows: list[Row]) -> list[Row]:
+    """Rows of the file as it is that were not measured now, and then those that were."""
+    path = HERE / "results" / "cold.json"
+    if not path.exists():
+        return rows
+    before = json.loads(path.read_text())
+    old = [Row(**{"load": None, "commit": before.get("commit", ""), **row}) for row in before["rows"]]
+    new = {row.what for row in rows}
+    return [row for row in old if row.what not in new] + rows
+
+
 def report(rows: list[Row], seen: dict[str, str | int]) -> str:
     """The table in Markdown."""
-    head = "| command | wall s | processor s | repeats | exit status | aim, wall s | met |"
+    head = "| command | wall s | processor s | repeats | exit status | aim, wall s | met | load | commit |"
     return "\n".join(
         [
             "# Commands from cold", "",
-            "Written by `python -m benchmarks.cold`; fewest seconds of some fresh processes.", "",
+            "Written by `python -m benchmarks.cold`; fewest seconds of some fresh processes.",
+            "Load: processes that run or wait for a core, mean of a minute, at the end of a row.",
+            "Where it exceeds the cores, only seconds of the processor compare.", "",
             ", ".join(f"{name} {value}" for name, value in seen.items()) + ".", "",
             head, "|---" * head.count(" | ") + "|---|", *map(line_of, rows), "",
         ]
     )  # fmt: skip
 
 
+def write_down(rows: list[Row]) -> None:
+    """Write the table; after each row, so that a run that is cut short leaves what it has measured."""
+    seen = origin()
+    (HERE / "results" / "cold.md").write_text(report(rows, seen))
+    content = {**seen, "rows": [asdict(row) for row in rows]}
+    (HERE / "results" / "cold.json").write_text(json.dumps(content, indent=1) + "\n")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--cases", type=int, default=5, help="cases of `discover`")
+    parser.add_argument("--cases", type=int, default=6, help="cases of `discover`")
+    parser.add_argument("--long", action="store_true", help="searches that take minutes too")
+    parser.add_argument("--against", metavar="TREE", help="time `discover` of another working tree in turn")
     parser.add_argument("--only", default="", help="rows in whose name or group this stands")
     parser.add_argument("--no-write", action="store_true", help="only print")
     options = parser.parse_args()
-    rows, seen = rows_of(options.repeats, options.cases, options.only), origin()
-    if not options.no_write:
-        (HERE / "results" / "cold.md").write_text(report(rows, seen))
-        content = {**seen, "rows": [asdict(row) for row in rows]}
-        (HERE / "results" / "cold.json").write_text(json.dumps(content, indent=1) + "\n")
+    rows = rows_of(options)
     return 0 if all(row.aim is None or row.wall <= row.aim for row in rows) else 1
 
 

@@ -16,6 +16,7 @@ from jaxid.discovery.at_rest.break_away import BreakAway, break_away
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.in_loop.search import explore_within
 from jaxid.discovery.noise import sensor_colour
+from jaxid.discovery.refit import in_simulation
 from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Search, Step
@@ -24,33 +25,23 @@ from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_force, need_known_controller, need_known_reference
-from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
-from jaxid.estimators.output_error import output_error, output_error_steps
-from jaxid.estimators.prediction_error import prediction_error, prediction_error_steps
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
-from jaxid.estimators.several.parts import parts_of
-from jaxid.estimators.simulated_output import choose_numerics
-from jaxid.gap import Gap, force_gap, gaps, noise_floor
+from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import free_effect
-from jaxid.numerics.lanes import run_alone
+from jaxid.numerics.lanes import begin, run_alone
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import Logs, OpenedLog, Session, open_session
 from jaxid.simulation.force_balance import ForceData
-from jaxid.simulation.sensor_noise import force_noise
 from jaxid.simulation.solvers import SOLVERS
-from jaxid.simulation.step_size import TooStiffError
 
-# A refit in simulation may raise the force residual by this factor. Beyond it the fit has bent the
-# parameters around another error, such as a reference that is not known between samples.
-_WORSE = 1.5
 # A residual counts as a disagreement only if it exceeds the noise floor by this factor.
 _ABOVE_FLOOR = 1.3
 # Number of effects that hinder the simulation and are replaced; further ones are only removed.
@@ -131,7 +122,14 @@ def explore(
         return explore_within(session, max_effects=max_effects, progress=progress)
     progress("fitting the declared model")
     baseline, search = start_search(session, progress)
+    # Compiling the refits takes as long as the search, and neither needs the other.
+    declared = begin(in_simulation, session, baseline, refit)
     steps = search.run(max_effects)
+    likely = search.model
+    refitted = None
+    if likely.added:
+        machine, _ = _final_machine(baseline.machine, search, {}, steps)
+        refitted = begin(_with_effects, session, machine, refit)
     alternatives = search.alternatives(steps)
     where = where_of(search, steps[0], session)
     final, effects = _final_machine(baseline.machine, search, alternatives, steps)
@@ -142,17 +140,20 @@ def explore(
         alternatives = search.alternatives(steps)
         final, effects = _final_machine(baseline.machine, search, alternatives, steps)
     verdict = _verdict(effects, where, steps, search)
-    before = baseline
-    after = _of_force(session.with_machine(final)) if effects else before
-    if refit:
-        progress("refitting in simulation")
-        before = _refit(session.with_machine(before.machine), before)
-        after = _refit(session.with_machine(after.machine), after) if effects else before
+    progress("refitting in simulation" if refit else "simulating")
+    before, old = declared.result()
+    after, new = before, old
+    if refitted is not None and search.model is not likely:
+        refitted.cancel()
+        refitted = None
+    if effects:
+        after, new = refitted.result() if refitted else _with_effects(session, final, refit)
     designs = session.machine.plant.designs_experiments if experiments is None else experiments
     if session.more and experiments:
         session.need_one_log("the design of experiments")
     designs = designs and not session.more
     separating = proposals(session, search, effects, progress) if designs else ()
+    simulated = after.machine
     unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
     # The trials of a start from rest run one machine.
     differ = session.more and any(run.own and run.own.plant for run in session.fits)
@@ -172,9 +173,9 @@ def explore(
         after, found, step = _with_break_away(after, search, c, b)
         steps.append(step)
         effects, verdict = (*effects, found), "found"
-    progress("simulating")
-    old = gaps(before.machine, session.runs)
-    new = gaps(after.machine, session.runs) if effects else old
+    if after.machine is not simulated:
+        progress("simulating")
+        new = gaps(after.machine, session.runs)
     return Discovery(
         session,
         verdict,
@@ -233,6 +234,11 @@ def start_search(
         validation_views=tuple(view(run).unscaled() for run in session.validations),
     )
     return baseline, search
+
+
+def _with_effects(session: Session, final: Machine, refit: bool) -> tuple[Estimate, tuple[Gap, ...]]:
+    """Fit the machine with the effects that were added, and return the fit and its gaps."""
+    return in_simulation(session, _of_force(session.with_machine(final)), refit)
 
 
 def _of_force(session: Session) -> Estimate:
@@ -364,89 +370,6 @@ def _final_machine(
         effects.append(NamedEffect(c.kind, c.label, place, names, score, alternatives.get(k, ())))
     final = machine.with_plant(plant, parameters).with_estimate(np.asarray(theta))
     return final, tuple(effects)
-
-
-def _refit(session: Session, start: Estimate) -> Estimate:
-    """Refit from the force-domain fit by the method that suits; keep the former if the fit fails."""
-    blind = not bool(np.all(start.identifiable))
-    if session.more:
-        return start if blind else _refit_together(session, start)
-    if not blind and choose_method(session).method == "prediction_error":
-        return _refit_innovations(session, start)
-    if blind or session.fit.log.reference is None and session.machine.controller is not None:
-        return start
-    try:
-        stated, log = session.case.output_error, session.fit.log
-        numerics = choose_numerics(session.machine, log, solver=stated.solver)
-        estimate = output_error(session.machine, log, numerics=numerics, minimiser=stated.minimiser)
-    except TooStiffError as error:
-        return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
-    except np.linalg.LinAlgError:
-        # An arm that stands upright falls without its loop: the baseline of a search may run off the log.
-        note = "not refitted in simulation: the simulated motion runs away from the log"
-        return replace(start, notes=(*start.notes, note))
-    if not estimate.converged or not np.all(np.isfinite(estimate.theta)):
-        note = f"output error: {estimate.message}; the parameters are those of inverse dynamics"
-        return replace(start, notes=(*start.notes, note))
-    old, new = (gaps(e.machine, (session.fit,))[0] for e in (start, estimate))
-    worse = np.any(new.force.rms > _WORSE * old.force.rms)
-    nearer = old.simulation is None or _length(new) < _length(old)
-    if new.simulation is None or worse or not nearer:
-        note = "output error did not reduce the simulation gap; the parameters are those of inverse dynamics"
-        return replace(start, notes=(*start.notes, note))
-    return estimate
-
-
-def _refit_together(session: Session, start: Estimate) -> Estimate:
-    """Refit several logs by the method that suits; keep the force-domain fit if the force gap grows."""
-    method = choose_method(session).method
-    if method == "inverse_dynamics" or (method == "output_error" and session.machine.controller is None):
-        return start
-    fit = {
-        "prediction_error": prediction_error_steps,
-        "output_error": output_error_steps,
-    }[method]
-    try:
-        estimate = run_alone(fit(session.machine, parts_of(session), start=start.theta))
-    except TooStiffError as error:
-        return replace(start, notes=(*start.notes, f"not refitted in simulation: {error}"))
-    what = method.replace("_", " ")
-    if not estimate.converged or not np.all(np.isfinite(estimate.theta)):
-        note = f"{what}: {estimate.message}; the parameters are those of inverse dynamics"
-        return replace(start, notes=(*start.notes, note))
-    for run in session.fits:
-        old, new = (force_gap(run.machine(e.machine), run.data).rms for e in (start, estimate))
-        if np.any(new > _WORSE * old):
-            note = f"{what} did not reduce the force gap; the parameters are those of inverse dynamics"
-            return replace(start, notes=(*start.notes, note))
-    return estimate
-
-
-def _refit_innovations(session: Session, start: Estimate) -> Estimate:
-    """Refit by prediction error from the force-domain fit; keep the latter if the force gap grows."""
-    machine, run = session.machine, session.fit
-    rest = np.asarray(run.data.recipe.rest_velocity)
-    estimate = prediction_error(
-        machine,
-        run.log,
-        start=start.theta,
-        rest_velocity=rest,
-        command_noise=force_noise(machine, run.data),
-        alone=True,
-    )
-    if not estimate.converged:
-        note = f"prediction error: {estimate.message}; the parameters are those of inverse dynamics"
-        return replace(start, notes=(*start.notes, note))
-    old, new = (force_gap(e.machine, run.data).rms for e in (start, estimate))
-    if np.any(new > _WORSE * old):
-        note = "prediction error did not reduce the force gap; the parameters are those of inverse dynamics"
-        return replace(start, notes=(*start.notes, note))
-    return estimate
-
-
-def _length(gap: Gap) -> float:
-    assert gap.simulation is not None, "the simulation of this gap has run"
-    return float(np.sqrt(np.nansum(gap.simulation.rms**2)))
 
 
 def _round(search: Search, step: Step) -> Round:

@@ -6,6 +6,7 @@ would take longer than the whole search.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -39,6 +40,8 @@ _PIECES = 4
 # Number of directions in which the superset is differentiated at once. It is small, so that the intermediate
 # arrays of a long log stay in the processor's cache.
 _COLUMNS = 4
+# Latest points of the superset whose residual and columns are kept: a search asks for most of them again.
+_POINTS = 8
 # Strength at which the columns of an added force are computed, relative to the strength of its start.
 _FAINT = 1e-6
 
@@ -233,6 +236,31 @@ class CandidateSamples:
             m[0] = False  # a piece does not continue the one before it
         self.moving = np.concatenate(moving)
         self.weight = np.concatenate([np.asarray(a.data.weight) for a in self.arrays])
+        self._latest: OrderedDict[tuple, _Point] = OrderedDict()
+
+    def evaluated(
+        self, superset: CandidateModel, theta: Float[np.ndarray, " p"], wanted: frozenset[int]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return residual and Jacobian as `evaluate` does, from a recent call if one had the same columns."""
+        key = (id(superset), theta.tobytes())
+        point = self._latest.setdefault(key, _Point(superset, {}))
+        self._latest.move_to_end(key)
+        if len(self._latest) > _POINTS:
+            self._latest.popitem(last=False)
+        found = next((known for asked, known in point.known.items() if wanted <= asked), None)
+        if found is None:
+            found = point.known[wanted] = evaluate_on(superset, self.arrays, theta, sorted(wanted))
+        return found
+
+
+class _Point(NamedTuple):
+    """What is known at one point of a superset: residual and Jacobian by the unknowns that it has columns of.
+
+    The superset is kept, so that no other one gets its identity.
+    """
+
+    superset: CandidateModel
+    known: dict[frozenset[int], tuple[np.ndarray, np.ndarray]]
 
 
 def _noisier(arrays: ForceData, force_noise: np.ndarray) -> ForceData:
@@ -255,7 +283,8 @@ def evaluate(
         theta: All unknowns of the superset.
         wanted: Indices of the unknowns that need derivatives; columns of others may be zero. None: all.
     """
-    return evaluate_on(superset, samples.arrays, theta, wanted)
+    asked = range(len(theta)) if wanted is None else np.asarray(wanted, int).tolist()
+    return samples.evaluated(superset, theta, frozenset(asked))
 
 
 def evaluate_on(

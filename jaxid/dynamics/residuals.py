@@ -5,13 +5,19 @@ The residual's Jacobian is the regressor: there is no other set of columns.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.dynamics.rhs import balance_of, phi
+from jaxid.model.effect import Effect, Signals
 from jaxid.model.plant import Plant
+from jaxid.numerics.affine import depends
 
 
 def integrate_internal_states(
@@ -38,25 +44,77 @@ def integrate_internal_states(
         return first
     motion = (q, qd, qdd, u, start + period * jnp.arange(q.shape[0]))
     own = jax.tree.map(lambda z: jnp.broadcast_to(z, (q.shape[0], *jnp.shape(z))), first)
+    for wave in _waves(plant, first, u.shape[1]):
+        numbers = [i for i in wave if not first[i].ndim]
+        vectors = [i for i in wave if first[i].ndim]
+        held = {i: jnp.zeros_like(first[i]) for i in wave}
+        push = _rates(plant, motion, own, held)
+        found = {}
+        if numbers:
+            moved = _rates(plant, motion, own, held | {i: jnp.ones_like(first[i]) for i in numbers})
+            columns = [jnp.stack([x[i] for i in numbers], axis=1) for x in (push, moved)]
+            starts = jnp.stack([first[i] for i in numbers])
+            together = _recurrence(starts, columns[1] - columns[0], columns[0], period)
+            found |= dict(zip(numbers, together.T, strict=True))
+        here = jax.tree.map(lambda a: a[0], (*motion, own))
+        for size in {first[i].size for i in vectors}:
+            slopes = _slopes(plant, here, [i for i in vectors if first[i].size == size], size)
+            found |= {i: _vector_recurrence(first[i], a, push[i], period) for i, a in slopes.items()}
+        own = tuple(found.get(i, z) for i, z in enumerate(own))
+    return own
+
+
+def _waves(plant: Plant, first: tuple, drives: int) -> list[list[int]]:
+    """Group the effects with an internal state, so that no rate in a group depends on a state in it.
+
+    A group shares its balances, where an arm with every candidate would take two for each effect. A rate
+    depends on states of effects that are before it in the same drive only, and not on these if the effect
+    makes no use of the drive's force. Groups are in the order in which their states are needed.
+    """
+    effects = plant.effects
+    place = [plant.drive_of(e.port, drives) for e in effects]
+    level: dict[int, int] = {}
     for i, z in enumerate(first):
         if z is None:
             continue
+        before = [
+            level[j]
+            for j in level
+            if place[j] is not None and place[j] == place[i] and _enters_drive(effects[j])
+        ]
+        needed = before and _uses_drive(effects[i], z)
+        level[i] = 1 + max(before) if needed else 0
+    return [[i for i in level if level[i] == k] for k in sorted(set(level.values()))]
 
-        def rate(value: Array, i: int = i, own: tuple = own) -> Array:
-            at = (*own[:i], jnp.broadcast_to(value, own[i].shape), *own[i + 1 :])
-            return jax.vmap(lambda *now: balance_of(plant, *now).rates[i])(*motion, at)
 
-        push = rate(jnp.zeros_like(z))
-        if z.ndim:
-            here = jax.tree.map(lambda a: a[0], (*motion, own))
-            slope = jax.jacfwd(
-                lambda v, i=i, at=here: balance_of(plant, *at[:5], (*at[5][:i], v, *at[5][i + 1 :])).rates[i]
-            )(z)
-            own = (*own[:i], _vector_recurrence(z, slope, push, period), *own[i + 1 :])
-            continue
-        decay = rate(jnp.ones_like(z)) - push
-        own = (*own[:i], _recurrence(z, decay, push, period), *own[i + 1 :])
-    return own
+def _enters_drive(effect: Effect) -> bool:
+    """Check that an effect may change the force of its drive; a user's may without declaring it."""
+    return effect.in_drive or type(effect).__module__.partition(".")[0] != "jaxid"
+
+
+def _uses_drive(effect: Effect, state: Array) -> bool:
+    """Check that the rate of an effect's state depends on the force of the drive, or may depend on it."""
+    zero, one = jnp.zeros(()), jnp.ones(())
+    still = {f.name: zero for f in fields(Signals)} | {"width": one, "dry_scale": one}
+    return depends(lambda u: effect.act(Signals(**still | {"u": u}), state).rate, (zero,))
+
+
+def _rates(plant: Plant, motion: tuple, own: tuple, values: Mapping[int, Any]) -> dict[int, Array]:
+    """Return the rates of some internal states along a motion, each state held at a value."""
+    at = tuple(jnp.broadcast_to(values[i], z.shape) if i in values else z for i, z in enumerate(own))
+    return jax.vmap(lambda *now: {i: balance_of(plant, *now).rates[i] for i in values})(*motion, at)
+
+
+def _slopes(plant: Plant, here: tuple, vectors: list[int], size: int) -> dict[int, Array]:
+    """Return the derivatives of rates by their own states, vectors of one size, at one instant."""
+    *motion, own = here
+
+    def rates(shift: Array) -> dict[int, Array]:
+        at = tuple(z + shift if i in vectors else z for i, z in enumerate(own))
+        whole = balance_of(plant, *motion, at).rates
+        return {i: whole[i] for i in vectors}
+
+    return jax.jacfwd(rates)(jnp.zeros(size))
 
 
 def _recurrence(start: Array, decay: Array, push: Array, h: Array | float) -> Array:

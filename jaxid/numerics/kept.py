@@ -28,6 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jaxid.numerics.lanes import quick_to_compile
+
 P = ParamSpec("P")
 T = TypeVar("T")
 # Environment variable with the folder; absent: nothing is kept.
@@ -172,7 +174,7 @@ def _compiled(
     flat.__name__ = flat.__qualname__ = name
     hits = _hits()
     lowered = jax.jit(flat).lower([np.asarray(x) for x in arrays])
-    compiled, skeleton = lowered.compile(), kept["skeleton"]
+    compiled, skeleton = lowered.compile(quick_to_compile()), kept["skeleton"]
     # JAX keeps the code too. XLA cannot write out again what it has read, and one copy is enough.
     for copy in path.parent.glob(f"jit_{name}-*"):
         copy.unlink(missing_ok=True)

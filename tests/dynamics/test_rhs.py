@@ -5,9 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 
 from jaxid.dynamics.dry_friction import set_valued_step
-from jaxid.dynamics.residuals import _recurrence, residual_along
+from jaxid.dynamics.residuals import _recurrence, integrate_internal_states, residual_along
 from jaxid.dynamics.rhs import State, small_solve, step
 from jaxid.effects import EFFECTS
 from jaxid.estimators.algebraic.windows import iterated_integral, weak_motion
@@ -306,3 +307,17 @@ def test_a_lag_follows_a_sine_to_the_order_of_the_cubic():
     steady = (jnp.sin(omega * t) - lag * omega * jnp.cos(omega * t)) / (1 + (lag * omega) ** 2)
     exact = steady + jnp.exp(-t / lag) * lag * omega / (1 + (lag * omega) ** 2)
     assert np.abs(np.asarray(z - exact)).max() < 1e-3
+
+
+def test_a_lag_behind_a_lag_gets_what_the_first_lets_through():
+    lags, period = (0.02, 0.05), 1e-3
+    effects = [EFFECTS["actuator_lag"](time_constant=lag) for lag in lags]
+    plant = Axis(MASS, effects=(effects[0], EFFECTS["hysteresis"](stiffness=2e3, level=5.0), effects[1]))
+    t = period * np.arange(600)
+    u, still = np.sin(30.0 * t)[:, None], np.zeros((600, 1))
+    own = jax.jit(integrate_internal_states)(plant, still, still, still, u, period)
+    for k, states in ((1, own[0]), (2, own[2])):
+        system = scipy.signal.lti([1.0], np.poly([-1 / lag for lag in lags[:k]]) * np.prod(lags[:k]))
+        exact = scipy.signal.lsim(system, np.interp(fine := np.arange(0, 0.599, 1e-5), t, u[:, 0]), fine)[1]
+        assert np.abs(np.asarray(states)[:-1] - exact[::100]).max() < 1e-4
+    assert not np.any(own[1])

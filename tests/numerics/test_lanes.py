@@ -5,7 +5,15 @@ import threading
 import numpy as np
 import pytest
 
-from jaxid.numerics.lanes import ParallelCalls, Precompile, SolveRequest, run_alone, run_batched
+from jaxid.numerics.lanes import (
+    ParallelCalls,
+    Precompile,
+    SolveRequest,
+    begin,
+    quick_to_compile,
+    run_alone,
+    run_batched,
+)
 
 
 def double(x):
@@ -74,3 +82,17 @@ def test_many_together_do_without(seen):
     many = [estimator(x, [Precompile(function, (x,), (function, x))]) for x in (1.0, 2.0, 3.0)]
     assert run_batched(many, 2) == [2.0, 4.0, 6.0]
     assert not threads
+
+
+def test_what_has_begun_runs_beside_and_its_error_is_that_of_its_result(seen):
+    function, threads, called = seen
+    begun = begin(function, 3.0)
+    assert called.wait(10)
+    assert threads[0] is not threading.current_thread()
+    with pytest.raises(ValueError, match="3.0"):
+        begun.result()
+    assert begin(double, 2.0).result() == 4.0
+
+
+def test_the_compiler_knows_the_option_that_halves_its_time():
+    assert quick_to_compile() == {"xla_cpu_use_fusion_emitters": False}
