@@ -172,9 +172,11 @@ def _compiled(
 
     name = path.name.removesuffix(_END).replace("-", "_")
     flat.__name__ = flat.__qualname__ = name
+    # Asking the compiler what it knows may read from the cache of JAX too.
+    options = quick_to_compile()
     hits = _hits()
     lowered = jax.jit(flat).lower([np.asarray(x) for x in arrays])
-    compiled, skeleton = lowered.compile(quick_to_compile()), kept["skeleton"]
+    compiled, skeleton = lowered.compile(options), kept["skeleton"]
     # JAX keeps the code too. XLA cannot write out again what it has read, and one copy is enough.
     for copy in path.parent.glob(f"jit_{name}-*"):
         copy.unlink(missing_ok=True)
