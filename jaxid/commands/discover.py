@@ -29,6 +29,7 @@ from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
+from jaxid.estimators.several.parts import parts_of
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
