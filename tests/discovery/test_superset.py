@@ -29,20 +29,39 @@ def test_a_large_union_is_differentiated_in_parts_alike(session, monkeypatch):
         theta[c.index] = c.probe(0)
     with monkeypatch.context() as at_once:
         at_once.setattr(cand, "_COLUMNS", len(theta))
-        e, whole = cand.evaluate(union, samples, theta)
+        e, whole = cand.evaluate_on(union, samples.arrays, theta)
     assert whole.shape[-1] > 5 * cand._COLUMNS
-    same, parts = cand.evaluate(union, samples, theta)
+    same, parts = cand.evaluate_on(union, samples.arrays, theta)
     np.testing.assert_allclose(same, e, rtol=1e-12)
     size = np.abs(whole).max(axis=(0, 1))
     assert np.all(np.abs(parts - whole).max(axis=(0, 1)) <= 1e-9 * size)
     wanted = [0, 9, 17]
-    same, some = cand.evaluate(union, samples, theta, wanted)
+    same, some = cand.evaluate_on(union, samples.arrays, theta, wanted)
     np.testing.assert_allclose(same, e, rtol=1e-12)
     np.testing.assert_array_equal(some[..., wanted], parts[..., wanted])
     assert not np.any(np.delete(some, wanted, axis=-1))
-    same, none = cand.evaluate(union, samples, theta, ())
+    same, none = cand.evaluate_on(union, samples.arrays, theta, ())
     np.testing.assert_allclose(same, e, rtol=1e-12)
     assert not np.any(none)
+
+
+def test_a_point_that_is_asked_for_again_is_not_computed_again(session, monkeypatch):
+    union = build_candidate_model(session.machine, session.fit.data)
+    samples, calls = cand.CandidateSamples(session.fit.data), []
+    evaluate_on = cand.evaluate_on
+    monkeypatch.setattr(cand, "evaluate_on", lambda *args: calls.append(1) or evaluate_on(*args))
+    theta = union.neutral.copy()
+    e, jacobian = cand.evaluate(union, samples, theta, [0, 9])
+    for fewer in ([9], ()):
+        same, again = cand.evaluate(union, samples, theta.copy(), fewer)
+        assert same is e
+        np.testing.assert_array_equal(again[..., list(fewer)], jacobian[..., list(fewer)])
+    assert len(calls) == 1
+    more = cand.evaluate(union, samples, theta, [17])[1]
+    moved = cand.evaluate(union, samples, theta + 1e-3, [0, 9])[0]
+    assert len(calls) == 3
+    assert np.any(more[..., 17] != jacobian[..., 17])
+    assert np.any(moved != e)
 
 
 @pytest.mark.parametrize("experiments", [True, False])
