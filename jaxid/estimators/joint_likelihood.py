@@ -158,6 +158,18 @@ class JointLikelihood:
         members = [replace(m, problem=m.problem._replace(low=m.at.floors[floor])) for m in self.members]
         return replace(self, members=tuple(members))
 
+    def sticks_surely(self, noises: Sequence[np.ndarray]) -> list[bool]:
+        """Check for each log that its noise is so small that it is known when a joint sticks."""
+        return [m.at.sticks_surely(noise) for m, noise in zip(self.members, noises, strict=True)]
+
+    def at_rest_too(self, chosen: Sequence[bool]) -> JointLikelihood:
+        """Return the likelihood with the samples at rest of the chosen logs."""
+        members = [
+            replace(m, problem=m.at.at_rest_too(m.problem)) if there else m
+            for m, there in zip(self.members, chosen, strict=True)
+        ]
+        return replace(self, members=tuple(members))
+
     def fit(self, theta: np.ndarray, noises: Sequence[np.ndarray], most: int) -> Steps[Maximum]:
         """Maximise the likelihood from physical values and logarithms of the noise of each log.
 

@@ -156,16 +156,18 @@ def prediction_error_steps(
             break
     assert end is not None, "there is at least one floor"
 
-    # Without noise of the force it is known when a joint sticks, and samples at rest count too.
-    sure = [m.at.sticks_surely(noise) for m, noise in zip(fit.members, noises, strict=True)]
-    if any(sure):
-        finer = [
-            replace(m, problem=m.at.at_rest_too(m.problem)) if s else m
-            for m, s in zip(fit.members, sure, strict=True)
-        ]
-        fit = replace(fit, members=tuple(finer))
-        end = yield from fit.fit(theta, noises, STEPS)
-        theta, steps = end.theta, steps + end.steps
+    # Without noise of the force it is known when a joint sticks, and samples at rest count too. If the noise
+    # rises with them, it holds the error of the steps in which a joint comes to rest: then they do not count.
+    sure = fit.sticks_surely(noises)
+    while any(sure):
+        rested = fit.at_rest_too(sure)
+        other = yield from rested.fit(theta, noises, STEPS)
+        steps += other.steps
+        still = [s and after for s, after in zip(sure, fit.sticks_surely(other.noises), strict=True)]
+        if still == sure:
+            fit, end, theta = rested, other, other.theta
+            break
+        sure = still
 
     reads = [np.zeros(m.drives) for m in fit.members]
     if end.converged:
