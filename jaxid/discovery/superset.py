@@ -133,11 +133,10 @@ def _missing(machine: Machine, cls: type[Effect], port: int, data: Prepared) -> 
 
 def _free_in_controller(machine: Machine, cls: type[Effect]) -> bool:
     """Check that the controller does not state what an effect is, and has the field that the effect sets."""
-    law = machine.controller
-    names = [name for name in (cls.controller_field, cls.duplicates_field) if name is not None]
-    if cls.controller_field is not None and (law is None or not (law.sees_error or cls.of_reference)):
-        return False
-    return law is None or all(getattr(law, name) is None for name in names)
+    law, name = machine.controller, cls.controller_field
+    if name is None:
+        return True
+    return law is not None and (law.sees_error or cls.of_reference) and getattr(law, name) is None
 
 
 def _limited(free: list[Free], limits: dict[str, tuple[float, float]]) -> list[Free]:

@@ -100,7 +100,9 @@ def searched(session: Session, machine: Machine) -> list[type[Effect]]:
         if (kind in case.kinds if case.kinds else cls.without_force or kind in asked)
     ]
     followed = [c for c in (*kinds, *case.own_effects) if c.break_away_level is None and not c.opens_spring]
-    return sorted(followed, key=lambda cls: cls.adds_spring)
+    law = machine.controller
+    apart = [c for c in followed if c.duplicates_field is None or getattr(law, c.duplicates_field) is None]
+    return sorted(apart, key=lambda cls: cls.adds_spring)
 
 
 def _at_scale(estimate: Estimate) -> tuple[Machine, int | None]:
