@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.controllers import Controller
+from jaxid.controllers import Controller, with_effects
 from jaxid.logs.log import Log
 from jaxid.model.plant import Plant
 from jaxid.model.units import Units
@@ -54,9 +54,21 @@ class Machine:
         return None if self.controller is None else self.controller.period
 
     @property
+    def law(self) -> Controller | None:
+        """The controller, with the fields that effects of the plant set."""
+        return None if self.controller is None else with_effects(self.controller, self.plant, self.gain.size)
+
+    @property
     def unknown_controller(self) -> tuple[str, ...]:
-        """Names of the unknowns of the controller."""
-        return tuple(f.name for f in self.parameters.free if f.path[0] == CONTROLLER)
+        """Names of the unknowns of the controller, those of effects on its command included."""
+        effects = self.plant.effects
+        return tuple(
+            f.name
+            for f in self.parameters.free
+            if f.path[0] == CONTROLLER
+            or f.effect is not None
+            and effects[f.effect].controller_field is not None
+        )
 
     def unforced(self, log: Log) -> bool:
         """Check that a log holds no force although a controller drives the machine."""

@@ -18,6 +18,7 @@ from jaxid.case.reference import read_signal, read_unknown_reference
 from jaxid.case.sensors import read_inertial_sensors
 from jaxid.case.tables import (
     TOP,
+    UNKNOWN_OF_CONTROLLER,
     ControllerTable,
     controller_keys,
     controller_table,
@@ -358,6 +359,7 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path, kinds:
     _check_recursive(tables.get("recursive", {}), root)
     check_kinds(_others(case, kinds.effects), root)
     _check_loop(case, root)
+    _check_command(case, root, kinds)
     return case
 
 
@@ -621,6 +623,32 @@ def _merged(base: Mapping[str, Any], columns: Mapping[str, Any], *, same_file: b
     dropped |= {"time"} if "sample_rate" in columns else set()
     dropped |= {"sample_rate"} if "time" in columns else set()
     return {**{key: value for key, value in base.items() if key not in dropped}, **columns}
+
+
+def _check_command(case: Case, root: Spot, kinds: Kinds) -> None:
+    """Refuse effects on the command without a controller, or beside the same key of [controller]."""
+    for entry in case.effects:
+        kind, name, spot = entry.cls.kind, entry.cls.controller_field, root.under("[[effects]]")
+        if name is None:
+            continue
+        if case.controller is None:
+            hint = "add [controller], or leave the effect out"
+            raise spot.fault(f"{kind} acts on the command of a controller, and there is none", hint)
+        if name in case.controller.law:
+            hint = "state it in one of the two places"
+            raise spot.fault(f"{kind} and [controller] {name} are both given, and are the same", hint)
+        if sum(other.cls is entry.cls for other in case.effects) > 1 and not _apart(case, entry.cls):
+            raise spot.fault(f"{kind} is given twice for one joint", "state it once")
+        if name not in controller_keys(case.controller.kind, kinds) and name in UNKNOWN_OF_CONTROLLER:
+            hint = "take another law, or leave the effect out"
+            what = f"{kind} does not go with [controller] kind = '{case.controller.kind}', which has no error"
+            raise spot.fault(what, hint)
+
+
+def _apart(case: Case, cls: type[Effect]) -> bool:
+    """Check that the entries of an effect are on different joints."""
+    ports = [port for entry in case.effects if entry.cls is cls for port in entry.ports]
+    return len(set(ports)) == len(ports)
 
 
 def _check_loop(case: Case, root: Spot) -> None:

@@ -27,8 +27,17 @@ if TYPE_CHECKING:
 FILE = Path(__file__).with_name("kinds.json")
 # Attributes of the classes that a case is checked against.
 _OF_PLANTS = ("linked", "usual_motion", "passives", "tools", "actuated")
-_OF_EFFECTS = ("on_request", "with_springs", "of_spring", "in_drive", "any_direction", "alternatives")
-_OF_LAWS = ("of_machine",)
+_OF_EFFECTS = (
+    "on_request",
+    "with_springs",
+    "of_spring",
+    "in_drive",
+    "needs_drive",
+    "controller_field",
+    "any_direction",
+    "alternatives",
+)
+_OF_LAWS = ("of_machine", "sees_error")
 # Numbers of places of a plant, which grow with its joints.
 _COUNTS = ("bodies", "springs", "links")
 # Depth at which the file holds a whole entry in one line: table, kind, part and field.

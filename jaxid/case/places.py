@@ -26,6 +26,7 @@ def read_ports(
         InputError: If a place does not exist on the plant, or does not go with the effect.
     """
     places = [name for name in PLACES if name in table]
+    driven_only = cls.in_drive or cls.needs_drive
     if len(places) > 1:
         raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
     parts, springs = plant.cls.bodies(plant.joints), plant.cls.springs(plant.joints)
@@ -58,7 +59,7 @@ def read_ports(
     for name, before in (("shaft", parts), ("passive", parts), ("tool", parts + passives)):
         if name not in table:
             continue
-        if cls.in_drive:
+        if driven_only:
             what, hint = f"has no command for {cls.kind} to act on", "name the joint of the drive"
             raise spot.at(name).refuse(table[name], what, hint)
         if name == "tool" and not cls.any_direction:
@@ -70,14 +71,14 @@ def read_ports(
         chosen = _places(_numbered(table, plant.names, spot), "joint", parts, spot)
         actuated = range(plant.joints) if plant.actuated is None else plant.actuated
         undriven = plant.actuated is not None and not set(chosen) <= set(actuated)
-        if cls.in_drive and undriven:
+        if driven_only and undriven:
             driven = ", ".join(str(k + 1) for k in actuated)
             what = f"has no drive for {cls.kind} to sit in"
             raise spot.at("joint").refuse(table["joint"], what, f"driven is: {driven}")
         return chosen, "joint"
     if cls.of_spring and springs:
         return tuple(range(parts, parts + springs)), "spring"
-    if cls.in_drive and plant.actuated is not None:
+    if driven_only and plant.actuated is not None:
         return plant.actuated, "joint"
     return tuple(range(parts)), "joint"
 

@@ -83,7 +83,7 @@ PLANT: Keys = {
 # Keys that an adaptive controller shares with [recursive].
 ON_LINE = ("half_life", "gate_velocity", "gate_acceleration", "rows", "start", "instrument")
 # Keys that may be unknown: the dimension of their value, in units of the command, and its sign.
-_UNKNOWN = {
+UNKNOWN_OF_CONTROLLER = {
     "kp": ("force/position", "positive"),
     "kv": ("force*time/position", "positive"),
     "ki": ("force/position", "nonnegative"),
@@ -91,9 +91,10 @@ _UNKNOWN = {
     "derivative_filter": ("time", "nonnegative"),
     "limit": ("force", "positive"),
     "delay": ("time", "nonnegative"),
+    "dead_band": ("position", "nonnegative"),
 }
-# Fields of every controller that the columns of a log decide.
-_OF_LOG = ("own_velocity",)
+# Fields of every controller that the columns of a log, or an effect, decide.
+_OF_LOG = ("own_velocity", "lag")
 # Laws whose gains may be unknown.
 _LINEAR = ("cascade_pd", "pd", "pid")
 # Laws whose gains act on a velocity that is itself a gain times the position error.
@@ -102,7 +103,7 @@ _CASCADES = ("cascade_pd",)
 
 def unknown_info(kind: str, name: str) -> ParameterInfo:
     """Return the declaration of a value of [controller] that may be unknown."""
-    dimension, sign = _UNKNOWN[name]
+    dimension, sign = UNKNOWN_OF_CONTROLLER[name]
     if kind in _CASCADES and name == "kp":
         dimension = "1/time"
     return ParameterInfo(dimension, sign, "")
@@ -178,7 +179,9 @@ def controller_table(given: Mapping[str, Any]) -> ControllerTable:
     """Return [controller] from its checked keys."""
     apart = ("kind", "period", "disturbance")
     law = {name: value for name, value in given.items() if name not in apart}
-    unknown = {name: value for name, value in law.items() if name in _UNKNOWN and _any_free(value)}
+    unknown = {
+        name: value for name, value in law.items() if name in UNKNOWN_OF_CONTROLLER and _any_free(value)
+    }
     law |= {name: at_start(value) for name, value in unknown.items()}
     return ControllerTable(**{name: given[name] for name in apart if name in given}, law=law, unknown=unknown)
 
@@ -213,14 +216,20 @@ def controller_keys(kind: str, kinds: Kinds) -> Keys:
         "disturbance": _DISTURBANCE,
     }
     cls = kinds.laws[kind]
-    unstated = {*keys, *_OF_LOG, *cls.of_machine}
+    if cls.sees_error:
+        keys["dead_band"] = Key(
+            by_drive(_maybe_unknown(number("nonnegative"), kind, "dead_band")),
+            "position error that counts as zero, with all smaller ones",
+            note="none",
+        )
+    unstated = {*keys, *_OF_LOG, "dead_band", *cls.of_machine}
     law = {}
     for f in fields(cls):
         if f.name not in unstated:
             required = f.default is MISSING and f.default_factory is MISSING
             plain = flag if f.type in (bool, "bool") else by_drive(number())
             read, doc = _LAW.get(f.name, (plain, "setting of the law"))
-            if f.name in _UNKNOWN:
+            if f.name in UNKNOWN_OF_CONTROLLER:
                 known = number("nonnegative") if f.name == "derivative_filter" else number()
                 read = by_drive(_maybe_unknown(known, kind, f.name))
             law[f.name] = Key(read, f"{doc}; it belongs to kind = '{kind}'", required)

@@ -13,8 +13,10 @@ from jaxid.case.user_faults import named_faults
 from jaxid.consistency.absent import acts_by_position
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.break_away import BreakAway, break_away
+from jaxid.discovery.final import final_machine
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.in_loop.search import explore_within
+from jaxid.discovery.in_loop.unforced import explore_unforced
 from jaxid.discovery.noise import sensor_colour
 from jaxid.discovery.refit import in_simulation
 from jaxid.discovery.result import Discovery, NamedEffect, Round
@@ -112,7 +114,10 @@ def explore(
         InputError: If the reference has unknowns.
     """
     need_known_reference(session, "an error of it would be taken for an effect")
-    need_force(session, "a search")
+    if session.machine.unforced(session.fit.log):
+        return explore_unforced(session, max_effects=max_effects, progress=progress)
+    need_force(session, "a search of a log with a force")
+    _need_no_command_effects(session)
     need_known_controller(session, "a search in forces does not simulate the loop")
     if session.fit.log.steady is not None:
         from jaxid.discovery.steady import explore_steady
@@ -129,17 +134,17 @@ def explore(
     likely = search.model
     refitted = None
     if likely.added:
-        machine, _ = _final_machine(baseline.machine, search, {}, steps)
+        machine, _ = final_machine(baseline.machine, search, {}, steps)
         refitted = begin(_with_effects, session, machine, refit)
     alternatives = search.alternatives(steps)
     where = where_of(search, steps[0], session)
-    final, effects = _final_machine(baseline.machine, search, alternatives, steps)
+    final, effects = final_machine(baseline.machine, search, alternatives, steps)
     progress("simulating the effects")
     while (c := hindering(search, session, final)) is not None:
         # After some removals nothing is added in exchange, because a search must end.
         steps += search.bar(c, WHY, max_effects if len(search.barred) < _BARRED else 0)
         alternatives = search.alternatives(steps)
-        final, effects = _final_machine(baseline.machine, search, alternatives, steps)
+        final, effects = final_machine(baseline.machine, search, alternatives, steps)
     verdict = _verdict(effects, where, steps, search)
     progress("refitting in simulation" if refit else "simulating")
     before, old = declared.result()
@@ -191,6 +196,21 @@ def explore(
         separating,
         unseen,
     )
+
+
+def _need_no_command_effects(session: Session) -> None:
+    """Refuse a search for an effect in front of the controller, which a logged force does not show.
+
+    Raises:
+        InputError: If the case asks for one.
+    """
+    for cls in session.case.searched:
+        if cls.controller_field is not None:
+            raise InputError(
+                f"{cls.kind} acts in front of the controller, and the log has a force, which comes after it",
+                where=f"{session.case.where}, [discover]",
+                hint="leave it out, or leave force out of [log] to search in the simulated loop",
+            )
 
 
 def start_search(
@@ -351,26 +371,6 @@ def _verdict(effects: tuple[NamedEffect, ...], where: Where, steps: list[Step], 
     rms = _rms(search, search.samples, baseline)
     above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.acceptance.above_numerics(baseline)
     return "unexplained" if above and where.significant else "nothing_missing"
-
-
-def _final_machine(
-    machine: Machine, search: Search, alternatives: dict[int, tuple[Score, ...]], steps: list[Step]
-) -> tuple[Machine, tuple[NamedEffect, ...]]:
-    """Return the case's machine with only the effects that were added, at their refitted values."""
-    plant, parameters = machine.plant, machine.parameters
-    theta = [*search.theta[search.superset.base]]
-    effects = []
-    for k, c in enumerate(search.added):
-        effect = cand.effect_at(search.superset, c, search.theta[c.index])
-        plant, free = free_effect(plant, effect, machine.units)
-        parameters = parameters.extended(free)
-        theta.extend(search.theta[c.index])
-        score = next(s.added for s in reversed(steps) if s.added and s.added.candidate is c)
-        names = tuple(f.name for f in free)
-        place = plant.place(c.port)
-        effects.append(NamedEffect(c.kind, c.label, place, names, score, alternatives.get(k, ())))
-    final = machine.with_plant(plant, parameters).with_estimate(np.asarray(theta))
-    return final, tuple(effects)
 
 
 def _round(search: Search, step: Step) -> Round:

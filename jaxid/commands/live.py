@@ -67,7 +67,7 @@ class Live:
         self.period: float = scene.drive.period
         self.online_estimate: OnlineEstimate | None = None
         self.switched: int | None = None
-        self._controller = scene.machine.controller
+        self._controller = scene.machine.law
         path = self._controller.path(jnp.asarray(self.reference))
         self._path = jax.tree.map(np.asarray, path)
         self._driven = self.machine.plant.driven(case.plant.joints)

@@ -18,6 +18,7 @@ from jaxid.comparison.screen import Scored, Screen, screen_changes
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.acceptance import RELEVANT, absorbed_noise
+from jaxid.discovery.domain import ForceDomain
 from jaxid.discovery.selection import MODEST, TIE_NATS, TIE_PART
 from jaxid.estimators.common.levenberg_marquardt import Transform
 
@@ -252,7 +253,9 @@ class Search:
         if change.effect is not None and not change.effect.amplitude.any():
             rows = [len(b) for b in screen.whitened.blocks]
             absorbed = [
-                absorbed_noise(self.superset, log.samples, log.colour, model.theta[k], new.theta[k])
+                absorbed_noise(
+                    ForceDomain(self.superset), log.samples, log.colour, model.theta[k], new.theta[k]
+                )
                 for k, log in enumerate(self.logs)
             ]
             after /= 1 - float(np.average(absorbed, weights=rows))

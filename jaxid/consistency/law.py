@@ -115,7 +115,7 @@ def law_at_ticks(machine: Machine, log: Log) -> LawAtTicks | None:
     Returns:
         The command at every tick; None in the cases in which `replayed_law` returns None.
     """
-    controller = machine.controller
+    controller = machine.law
     if not isinstance(controller, _PLAIN) or log.reference is None or not all(log.measured):
         return None
     if machine.unknown_controller:

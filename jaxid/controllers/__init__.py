@@ -7,6 +7,7 @@ from jaxid.controllers.adaptive import Adaptive as Adaptive
 from jaxid.controllers.base import Controller as Controller
 from jaxid.controllers.base import Path as Path
 from jaxid.controllers.base import Tick as Tick
+from jaxid.controllers.base import with_effects as with_effects
 from jaxid.controllers.computed_torque import ComputedTorque
 from jaxid.controllers.flatness import Flatness
 from jaxid.controllers.flatness import flat_inputs as flat_inputs

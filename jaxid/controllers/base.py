@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -9,8 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.numerics.delays import shifted
-from jaxid.numerics.smooth import sharp_clip
+from jaxid.model.parameter import parameters_of
+from jaxid.model.plant import Plant
+from jaxid.numerics.delays import lagged, shifted
+from jaxid.numerics.smooth import outside, sharp_clip
 
 
 class Path(eqx.Module):
@@ -88,6 +91,9 @@ class Controller(eqx.Module):
         limit: Bound of the magnitude of the command; None: no bound.
         delay: Transport delay of the reference [s], one for all drives or one each; None: none. Between two
             ticks the delayed reference is interpolated, so that derivatives by the delay exist.
+        lag: Time constant of a first-order lag of the reference [s], as for `delay`; None: none. See `path`.
+        dead_band: Position error that counts as zero, with all smaller ones [m or rad], as for `delay`; None:
+            none. A larger error is not reduced.
         velocity_average: Number of samples whose mean is differenced backwards for the velocity.
         own_velocity: Whether the drive measures the velocity, so that no position is differenced for it.
     """
@@ -95,6 +101,8 @@ class Controller(eqx.Module):
     period: float = eqx.field(static=True, kw_only=True)
     limit: Array | None = eqx.field(default=None, kw_only=True)
     delay: Array | None = eqx.field(default=None, kw_only=True)
+    lag: Array | None = eqx.field(default=None, kw_only=True)
+    dead_band: Array | None = eqx.field(default=None, kw_only=True)
     velocity_average: int = eqx.field(static=True, default=1, kw_only=True)
     own_velocity: bool = eqx.field(static=True, default=False, kw_only=True)
 
@@ -102,15 +110,23 @@ class Controller(eqx.Module):
     anticipates: ClassVar[bool] = False
     # Fields that no case states: model, gain and estimator of the machine.
     of_machine: ClassVar[tuple[str, ...]] = ()
+    # Whether its command depends on the difference of reference and position, which a dead band can hide.
+    sees_error: ClassVar[bool] = True
     # Whether the law needs a drive at every joint.
     every_drive: ClassVar[bool] = False
     # Whether joints without a drive are allowed only if their accelerations enter no other joint's balance.
     separate_drives: ClassVar[bool] = False
 
     def path(self, reference: Float[Array, "ticks m"]) -> Path:
-        """Return the delayed reference with the derivatives that the law needs, by central differences."""
+        """Return the reference behind delay and lag, with the derivatives that the law needs.
+
+        The lag takes a step of backward Euler at each tick, so that without a time constant the reference
+        passes; it has settled at the first reference. Derivatives are central differences.
+        """
         if self.delay is not None:
             reference = shifted(reference, self.delay / self.period)
+        if self.lag is not None:
+            reference = lagged(reference, self.period / (self.period + self.lag))
         if not self.anticipates:
             return Path(reference)
         before = jnp.concatenate([2 * reference[:1] - reference[1:2], reference[:-1]])
@@ -159,6 +175,32 @@ class Controller(eqx.Module):
         u, inner = self.law(tick, velocity, inner, disturbance)
         return self.clipped(u + disturbance), ((tick.joints, *past[:-1]), inner)
 
+    def error(self, tick: Tick) -> Array:
+        """Return the position error of the driven joints that the law sees."""
+        error = tick.reference - tick.position
+        return error if self.dead_band is None else outside(error, self.dead_band)
+
     def clipped(self, u: Array) -> Array:
         """Clip the command to its limit."""
         return u if self.limit is None else sharp_clip(u, self.limit)
+
+
+def with_effects(controller: Controller, plant: Plant, drives: int) -> Controller:
+    """Return a controller with the fields that effects of the plant set, such as a delay of the command.
+
+    Args:
+        controller: The controller of the case.
+        plant: The plant with its effects.
+        drives: Number of drives.
+    """
+    by_field: dict[str, list[Array | float]] = {}
+    for e in plant.effects:
+        drive = plant.drive_of(e.port, drives)
+        if e.controller_field is None or drive is None:
+            continue
+        stated = getattr(controller, e.controller_field)
+        known = [0.0] * drives if stated is None else list(jnp.broadcast_to(jnp.asarray(stated), (drives,)))
+        (value,) = (getattr(e, name) for name in parameters_of(type(e)))
+        by_field.setdefault(e.controller_field, known)[drive] = value
+    fields = {name: jnp.stack([jnp.asarray(v, float) for v in values]) for name, values in by_field.items()}
+    return replace(controller, **fields) if fields else controller

@@ -86,7 +86,7 @@ class FeedForward(Controller):
         slope = (tick.reference - past[-1]) / (self.velocity_average * self.period)
         measured = tick.velocity is not None
         slope = tick.path.derivatives[0] if measured else slope
-        error = tick.reference - tick.position
+        error = self.error(tick)
         parts = self.kp * error, self.kd * (slope - tick.at_drives(velocity))
         fresh = tick.fresh, tick.renewed if measured else tick.fresh
         held = jnp.stack([jnp.where(f, u, old) for f, u, old in zip(fresh, parts, held, strict=True)])

@@ -73,6 +73,7 @@ class Flatness(Controller):
     anticipates: ClassVar[bool] = True
     of_machine: ClassVar[tuple[str, ...]] = ("model", "gain")
     separate_drives: ClassVar[bool] = True
+    sees_error: ClassVar[bool] = False
 
     poles: tuple[float, ...] = eqx.field(static=True, converter=tuple)
     epsilon: Array

@@ -18,7 +18,7 @@ class CascadePD(Controller):
     kv: Array
 
     def law(self, tick: Tick, velocity: Array, memory: None, disturbance: Array) -> tuple:
-        error = tick.reference - tick.position
+        error = self.error(tick)
         return self.kv * (self.kp * error - tick.at_drives(velocity)), None
 
 
@@ -39,7 +39,7 @@ class PD(Controller):
 
     def law(self, tick: Tick, velocity: Array, memory: Array, disturbance: Array) -> tuple:
         slope = (tick.reference - memory) / self.period if self.derivative == "error" else 0.0
-        error = tick.reference - tick.position
+        error = self.error(tick)
         return self.kp * error + self.kd * (slope - tick.at_drives(velocity)), tick.reference
 
 
@@ -90,7 +90,7 @@ class PID(Controller):
 
     def law(self, tick: Tick, velocity: Array, memory: Any, disturbance: Array) -> tuple:
         last, integral, slope = memory
-        error = tick.reference - tick.position
+        error = self.error(tick)
         raw = (tick.reference - last) / self.period - tick.at_drives(velocity)
         # Backward Euler, so that a filter faster than the sampling only passes the difference.
         slope = slope + (raw - slope) * self.period / (self.period + self.derivative_filter)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.stats
@@ -10,6 +11,7 @@ from jaxtyping import Float
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
+from jaxid.discovery.domain import Domain, ForceDomain, Samples
 from jaxid.discovery.noise import NUMERICS
 from jaxid.discovery.selection import TIE_NATS
 from jaxid.logs.prepare import Prepared
@@ -53,13 +55,17 @@ class Acceptance:
     more: tuple[tuple[Prepared, cand.View], ...] = ()
     validation_views: tuple[cand.View, ...] = ()
 
+    # Least part of a residual that counts as gap.
+    least_gap: ClassVar[float] = 0.5
+
     def __post_init__(self) -> None:
+        self.domain: Domain = ForceDomain(self.superset)
         machine = self.superset.machine
         force_std = machine.sensor.force_noise
         noise = None if force_std is None else np.asarray(force_std) * machine.gain
-        self.samples = cand.CandidateSamples(self.data, noise, self.view, self.more)
+        self.samples: Any = cand.CandidateSamples(self.data, noise, self.view, self.more)
         views = self.validation_views or (None,) * len(self.validation)
-        self.others = [
+        self.others: list[Any] = [
             cand.CandidateSamples(d, noise, view) for d, view in zip(self.validation, views, strict=True)
         ]
         force = self.data.at_kept(self.data.force - np.mean(self.data.force, axis=0))
@@ -67,9 +73,14 @@ class Acceptance:
         self._numerics = rows * float(np.sum((NUMERICS * force) ** 2))
         self._noise = float(np.sum(self.samples.moving.sum(axis=0) * np.square(self.floor)))
 
+    @property
+    def _independent(self) -> float:
+        """Part of the samples that a filter leaves independent of each other."""
+        return self.data.recipe.independent
+
     def residual(self, theta: np.ndarray) -> Float[np.ndarray, "kept n"]:
         """Return the force residual of a model on the fitted log."""
-        return cand.evaluate(self.superset, self.samples, theta, ())[0]
+        return self.domain.evaluate(self.samples, theta, ())[0]
 
     def squares(self, theta: np.ndarray) -> float:
         """Return the sum of squares of the residual; infinite if it diverged."""
@@ -81,9 +92,9 @@ class Acceptance:
 
         The validation logs are included: an effect that a fit absorbs on the fitted log may show on another.
         """
-        part = self.data.recipe.independent
+        part = self._independent
         for samples in (self.samples, *self.others):
-            e, moving = cand.evaluate(self.superset, samples, theta, ())[0], samples.moving
+            e, moving = self.domain.evaluate(samples, theta, ())[0], samples.moving
             for x, counts, floor in zip(e.T, moving.T, self.floor, strict=True):
                 scatter = np.sqrt(0.5 / max(part * counts.sum(), 1))
                 if np.sqrt(np.mean(x[counts] ** 2)) > floor * (1 + _SCATTER * scatter):
@@ -99,13 +110,13 @@ class Acceptance:
         before, after = self._sum(old), self._sum(new)
         if before - after < self._numerics:
             return 0.0
-        # The floor is itself an estimate, and a search always finds something to close: at least half of the
-        # residual counts as gap.
-        return float((before - after) / max(before - self._noise, 0.5 * before))
+        # The floor is itself an estimate, and a search always finds something to close: at least a part of
+        # the residual counts as gap.
+        return float((before - after) / max(before - self._noise, self.least_gap * before))
 
-    def absorbed_noise(self, samples: cand.CandidateSamples, old: np.ndarray, new: np.ndarray) -> float:
+    def absorbed_noise(self, samples: Samples, old: np.ndarray, new: np.ndarray) -> float:
         """Return the part of the noise that a new model's drive filters out; see `absorbed_noise`."""
-        return absorbed_noise(self.superset, samples, self.colour, old, new)
+        return absorbed_noise(self.domain, samples, self.colour, old, new)
 
     def confirmed(
         self, old: np.ndarray, new: np.ndarray, *, drive: bool
@@ -125,7 +136,7 @@ class Acceptance:
         total, worst = 0.0, np.inf
         for samples in self.others:
             before, after = (
-                np.where(samples.moving, cand.evaluate(self.superset, samples, theta, ())[0], 0.0)
+                np.where(samples.moving, self.domain.evaluate(samples, theta, ())[0], 0.0)
                 for theta in (old, new)
             )
             whitener = ev.Whitener.of(after, samples.moving, self.colour)
@@ -140,7 +151,7 @@ class Acceptance:
         """Return the expected gain in log-likelihood of the true one of two models over the other [nats]."""
         total = 0.0
         for samples in (self.samples, *self.others):
-            e, other = (cand.evaluate(self.superset, samples, theta, ())[0] for theta in (one, two))
+            e, other = (self.domain.evaluate(samples, theta, ())[0] for theta in (one, two))
             whitener = ev.Whitener.of(e, samples.moving, self.colour)
             total += 0.5 * float(np.sum(whitener((e - other)[..., None]) ** 2))
         return total
@@ -190,7 +201,7 @@ class Acceptance:
         Source:
             Satterthwaite (1946) for sums of squares with unequal weights, here by joint.
         """
-        count = self.data.recipe.independent * self.samples.moving.sum(axis=0)
+        count = self._independent * self.samples.moving.sum(axis=0)
         weight = np.square(self.floor)
         fourth = float(np.sum(count * weight**2))
         if fourth == 0:
@@ -204,8 +215,8 @@ class Acceptance:
 
 
 def absorbed_noise(
-    superset: cand.CandidateModel,
-    samples: cand.CandidateSamples,
+    domain: Domain,
+    samples: Samples,
     colour: tuple[NoiseModel, ...],
     old: np.ndarray,
     new: np.ndarray,
@@ -216,7 +227,7 @@ def absorbed_noise(
     too, and would gain by it without explaining anything.
 
     Args:
-        superset: Machine with all candidates.
+        domain: Where residuals are compared.
         samples: Samples of the log.
         colour: Noise expected from the sensors, by joint.
         old, new: All unknowns of the two models.
@@ -229,7 +240,7 @@ def absorbed_noise(
     whitener = ev.Whitener(colour, samples.moving)
     squares = []
     for theta in (old, new):
-        e, _ = cand.evaluate(superset, samples, theta, ())
-        noisier, _ = cand.evaluate_on(superset, samples.noisier, theta, ())
+        e, _ = domain.evaluate(samples, theta, ())
+        noisier = domain.noisier(samples, theta)
         squares.append(float(np.mean(whitener((noisier - e)[..., None]) ** 2)))
     return min(squares[0] - squares[1], 0.9)

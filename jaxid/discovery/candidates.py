@@ -7,9 +7,9 @@ would take longer than the whole search.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -338,9 +338,13 @@ def _directional_derivatives(
 
 
 def refine(
-    superset: CandidateModel, data: CandidateSamples, theta: Float[np.ndarray, " p"], moving: np.ndarray
+    superset: CandidateModel,
+    data: Any,
+    theta: Float[np.ndarray, " p"],
+    moving: np.ndarray,
+    at_point: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> tuple[Float[np.ndarray, " p"], bool]:
-    """Fit some unknowns of the superset in the force domain, with the others fixed.
+    """Fit some unknowns of the superset, with the others fixed.
 
     The superset's Jacobian is compiled already; calling it from a host solver costs less than compiling a
     second one inside a loop.
@@ -350,6 +354,8 @@ def refine(
         data: Samples of the log.
         theta: All unknowns at the start.
         moving: Indices of the unknowns to fit.
+        at_point: Function of samples, unknowns and wanted derivatives that computes residual and Jacobian;
+            None: `evaluate`, in forces.
 
     Returns:
         All unknowns, and whether the solver converged.
@@ -357,6 +363,7 @@ def refine(
     if not len(moving):
         return theta.copy(), True
     some = free_of(superset, moving)
+    evaluated = at_point or (lambda data, at, wanted: evaluate(superset, data, at, wanted))
     transform = Transform.of(some)
     lower, upper = (np.asarray(transform.inward(b)) for b in some.bounds)
     weight = data.weight[..., None]
@@ -369,7 +376,7 @@ def refine(
             latest.clear()
             at = theta.copy()
             at[moving] = np.asarray(transform.outward(jnp.asarray(x)))
-            e, jacobian = evaluate(superset, data, at, moving)
+            e, jacobian = evaluated(data, at, moving)
             slope = np.asarray(transform.slope(jnp.asarray(at[moving])))
             with np.errstate(invalid="ignore", over="ignore"):  # diverged values are made finite below
                 rows = (jacobian[..., moving] * slope * weight).reshape(-1, len(moving))

@@ -49,11 +49,15 @@ class Round:
         step: The step of the search.
         fit: RMS force residual on the fitted log, by joint.
         validation: The largest RMS of the validation logs, by joint; None without any.
+        position_fit, position_validation: The same of the simulated position, for logs without a force, of
+            which the former are NaN; None for others.
     """
 
     step: Step
     fit: np.ndarray
     validation: np.ndarray | None
+    position_fit: np.ndarray | None = None
+    position_validation: np.ndarray | None = None
 
 
 @dataclass(frozen=True, repr=False)

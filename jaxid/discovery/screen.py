@@ -78,16 +78,13 @@ def screen_candidates(search: Search, model: Model, *, ahead: bool = False) -> S
         ahead: True to score every two candidates together too.
     """
     active = search.fitted_by(model.added)
-    e, jacobian = cand.evaluate(search.superset, search.samples, model.theta, active)
+    e, jacobian = search.domain.evaluate(search.samples, model.theta, active)
     base = jacobian[..., active]
     counts = search.samples.moving
     scale = np.array([c.innovation for c in search.colour])
 
     rest = search.rest(model)
-    points = cand.points(search.superset, rest, search.samples, model.theta, e)
-    for c in rest:
-        if c.has_grid:
-            points.extend(search.grid_points(c))
+    points = search.domain.points(rest, search.samples, model.theta, e)
     points = [p for p in points if has_influence(p, counts, scale)]
 
     extra = all_columns(e, base, points, counts, scale)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.acceptance import RELEVANT, Acceptance
+from jaxid.discovery.domain import Domain
 from jaxid.discovery.score import Score
 from jaxid.discovery.screen import Screen, guess_pair, screen_candidates
 from jaxid.discovery.selection import MODEST, margin, next_effect, shortlist, simplest_equivalent
@@ -96,7 +97,17 @@ class Search:
     validation_views: tuple[cand.View, ...] = ()
 
     def __post_init__(self) -> None:
-        self.acceptance = Acceptance(
+        self.acceptance = self._acceptance()
+        self.domain: Domain = self.acceptance.domain
+        self.samples = self.acceptance.samples
+        self.model = Model((), self.superset.neutral)
+        # The largest threshold so far, by which effects are dropped later.
+        self._limit = 0.0
+        self._baseline = self.model.theta
+
+    def _acceptance(self) -> Acceptance:
+        """Return the tests of models against the logs, with the domain in which they are compared."""
+        return Acceptance(
             self.superset,
             self.data,
             self.validation,
@@ -106,12 +117,6 @@ class Search:
             self.more,
             self.validation_views,
         )
-        self.samples = self.acceptance.samples
-        self.model = Model((), self.superset.neutral)
-        self._grid_points: dict[tuple[str, int], list[cand.Point]] = {}
-        # The largest threshold so far, by which effects are dropped later.
-        self._limit = 0.0
-        self._baseline = self.model.theta
 
     @property
     def added(self) -> tuple[cand.Candidate, ...]:
@@ -136,13 +141,6 @@ class Search:
         """Return the candidates that a model, by default the current one, may still get."""
         gone = [*(self.model if model is None else model).added, *self.barred]
         return [c for c in self.superset.candidates if all(c is not g for g in gone)]
-
-    def grid_points(self, candidate: cand.Candidate) -> list[cand.Point]:
-        """Linearise a candidate at its many starts; the result is kept, since no other effect enters it."""
-        key = (candidate.kind, candidate.port)
-        if key not in self._grid_points:
-            self._grid_points[key] = cand.grid_points(self.superset, candidate, self.samples)
-        return self._grid_points[key]
 
     def run(self, most: int) -> list[Step]:
         """Add effects until none is accepted, and drop those that become superfluous on the way.
@@ -266,7 +264,7 @@ class Search:
         if one is not None:
             reached = pairs.with_partner(one.candidate.kind, one.candidate.port)
         active = self.fitted_by(model.added)
-        e, jacobian = cand.evaluate(self.superset, self.samples, model.theta, active)
+        e, jacobian = self.domain.evaluate(self.samples, model.theta, active)
 
         for *points, gained in pairs.best(broken):
             if gained < reached + max(_CLEARLY * screened.threshold, _MUCH * gained):
@@ -360,7 +358,7 @@ class Search:
 
     def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
         """Fit the active unknowns to the log, from and beside the others."""
-        return cand.refine(self.superset, self.samples, theta, active)[0]
+        return cand.refine(self.superset, self.samples, theta, active, self.domain.evaluate)[0]
 
     def _step(
         self,
@@ -395,7 +393,7 @@ class Search:
             fits.append(self._fit(theta, active))
         theta = min(fits, key=self.acceptance.squares)
 
-        e, jacobian = cand.evaluate(self.superset, self.samples, theta, active)
+        e, jacobian = self.domain.evaluate(self.samples, theta, active)
         after = screened.held_out(e, jacobian[..., active])
         drive = any(not s.candidate.amplitude.any() for s in new)
         if drive:
@@ -422,11 +420,11 @@ class Search:
     def _costs(self, model: Model, smaller: Model, limit: float) -> bool:
         """Check that a smaller model is worse than a model by more than noise and by a relevant part."""
         active, remaining = self.fitted_by(model.added), self.fitted_by(smaller.added)
-        e, jacobian = cand.evaluate(self.superset, self.samples, model.theta, active)
+        e, jacobian = self.domain.evaluate(self.samples, model.theta, active)
         whitener = ev.Whitener.of(e, self.samples.moving, self.colour)
         now = Screen.of(whitener, e, jacobian[..., active])
 
-        less, jacobian = cand.evaluate(self.superset, self.samples, smaller.theta, remaining)
+        less, jacobian = self.domain.evaluate(self.samples, smaller.theta, remaining)
         after = now.held_out(less, jacobian[..., remaining])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
         return lost > limit and self.acceptance.closed(less, e) > _SUPERFLUOUS

@@ -120,6 +120,8 @@ def _missing(machine: Machine, cls: type[Effect], port: int, data: Prepared) -> 
     plant = machine.plant
     if not plant.accepts(cls, port, data.force.shape[1]):
         return False
+    if not _free_in_controller(machine, cls):
+        return False
     if cls.of_rotary and (plant.motion(port) or machine.units.motion) != "rotary":
         return False
     equivalent = plant.equivalent_parameter(cls, port)
@@ -127,6 +129,14 @@ def _missing(machine: Machine, cls: type[Effect], port: int, data: Prepared) -> 
         f.path == (equivalent[0],) and f.index == equivalent[1] for f in machine.parameters.free
     )
     return not fitted and all(e.kind != cls.kind or e.port != port for e in plant.effects)
+
+
+def _free_in_controller(machine: Machine, cls: type[Effect]) -> bool:
+    """Check that the controller does not state what an effect is, and has the field that the effect sets."""
+    law, name = machine.controller, cls.controller_field
+    if name is None:
+        return True
+    return law is not None and (law.sees_error or cls.of_reference) and getattr(law, name) is None
 
 
 def _limited(free: list[Free], limits: dict[str, tuple[float, float]]) -> list[Free]:

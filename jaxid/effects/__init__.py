@@ -10,6 +10,7 @@ from jaxid.effects.registry import EFFECTS as EFFECTS
 from jaxid.effects.registry import register as register
 
 from jaxid.effects import actuator as actuator  # isort: skip
+from jaxid.effects import command as command  # isort: skip
 from jaxid.effects import coupling as coupling  # isort: skip
 from jaxid.effects import friction as friction  # isort: skip
 from jaxid.effects import hysteresis as hysteresis  # isort: skip

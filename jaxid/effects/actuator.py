@@ -82,6 +82,8 @@ class ActuatorOffset(Effect):
 class ActuatorLag(Effect):
     """First-order lag between declared and applied force: T df/dt = u - f."""
 
+    without_force = True
+
     adds_force = False
     in_drive = True
 
@@ -129,6 +131,9 @@ class InputDelay(Effect):
 @register("saturation")
 class Saturation(Effect):
     """The force at the load is clipped to plus or minus limit."""
+
+    without_force = True
+    duplicates_field = "limit"
 
     adds_force = False
     in_drive = True

@@ -57,6 +57,8 @@ class JointFlexibility(Effect):
     frequency, and e': both have one size.
     """
 
+    without_force = True
+
     with_springs = False
     adds_spring = True
 

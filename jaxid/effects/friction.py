@@ -15,6 +15,8 @@ from jaxid.numerics import smooth
 class ViscousFriction(Effect):
     """-c v."""
 
+    without_force = True
+
     any_direction = True
     viscous_coefficient = "coefficient"
 
@@ -46,6 +48,8 @@ class BackEmfDamping(Effect):
 @register("coulomb_friction")
 class CoulombFriction(Effect):
     """-F sign v, set-valued at rest; F is `level`, or `friction_coefficient` times normal force."""
+
+    without_force = True
 
     sliding_level = "level"
     alternatives = ("level", "friction_coefficient")
@@ -82,6 +86,8 @@ class StaticFriction(Effect):
 class StribeckFriction(Effect):
     """-F_s exp(-(v/v_s)^2) sign v: the part above Coulomb friction at low velocity."""
 
+    without_force = True
+
     stribeck_velocity = "velocity"
 
     level: Array = parameter("force", "nonnegative", "F_s, excess at low velocity")
@@ -94,6 +100,43 @@ class StribeckFriction(Effect):
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
         widths = (0.02, 0.05, 0.1, 0.2, 0.4, 0.7)
         return [{"level": scales.force, "velocity": scales.velocity * w} for w in widths]
+
+
+@register("load_friction")
+class LoadFriction(Effect):
+    """-mu |tau| sign v, set-valued at rest; tau is the drive's torque at the joint, before friction.
+
+    Friction of a gear, whose teeth press with the torque that it transmits. mu is `coefficient` while the
+    motor drives the load, and `back` while the load drives the motor, tau v < 0; without `back` the two are
+    the same. At rest the level adds to that which must be overcome.
+
+    Source:
+        Duclusaud et al. (2025), "Extended friction models for the physics simulation of servo actuators",
+        models 3 and 5: friction in proportion to the load, the same or by direction of the power.
+    """
+
+    needs_drive = True
+    on_request = True
+    without_force = True
+
+    coefficient: Array = parameter("1", "nonnegative", "mu while the motor drives")
+    back: Array | None = parameter("1", "nonnegative", "mu while the load drives", optional=True)
+
+    adds_force = False
+
+    def act(self, x: Signals, state: None) -> Action:
+        part = self.coefficient
+        if self.back is not None:
+            part = jnp.where(x.u * x.yd < 0, self.back, part)
+        return Action(dry=part * jnp.abs(x.u))
+
+    @classmethod
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"coefficient": 0.0}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"coefficient": 0.0}, {"coefficient": 0.1}]
 
 
 @register("asymmetric_viscous")
@@ -109,6 +152,8 @@ class AsymmetricViscous(Effect):
 @register("quadratic_drag")
 class QuadraticDrag(Effect):
     """-c v |v|."""
+
+    without_force = True
 
     coefficient: Array = parameter("force*time2/position2", "free", "c")
 

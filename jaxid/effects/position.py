@@ -15,6 +15,8 @@ from jaxid.model.parameter import parameter
 class ConstantForce(Effect):
     """F0: an offset of the drive, or Coulomb levels that differ by direction."""
 
+    without_force = True
+
     level: Array = parameter("force", "free", "F0")
 
     def act(self, x: Signals, state: None) -> Action:
@@ -24,6 +26,8 @@ class ConstantForce(Effect):
 @register("linear_stiffness")
 class LinearStiffness(Effect):
     """-k q."""
+
+    without_force = True
 
     of_spring = True
 
@@ -67,6 +71,8 @@ class Unbalance(Effect):
     Source:
         The torque of a point mass on a lever, m g r cos of its angle above the horizontal.
     """
+
+    without_force = True
 
     of_rotary = True
     # A search by default would have to tell it from a ripple of one period a turn.

@@ -174,7 +174,7 @@ def choose_numerics(
         set_valued=not breaks_away and solver is None,
         solver=solver,
     )
-    if log.passive and solver is None:
+    if log.passive and machine.controller is None and solver is None:
         # Without noise of a force the phase of a swing is so precise that it shows the error of a step.
         numerics = replace(numerics, substeps=max(numerics.substeps, _FREE))
     if not numerics.set_valued and solver is None:

@@ -151,6 +151,16 @@ class Effect(eqx.Module):
     adds_force: ClassVar[bool] = True
     # Whether it changes the force that the drive of its joint delivers.
     in_drive: ClassVar[bool] = False
+    # Whether it acts on joints with a drive only, although it leaves the force of the drive as it is.
+    needs_drive: ClassVar[bool] = False
+    # Field of the controller that its only parameter sets; None: it does not act on the controller.
+    controller_field: ClassVar[str | None] = None
+    # Whether that field is one of the reference, which every law follows.
+    of_reference: ClassVar[bool] = False
+    # Field of the controller of which it is the same further along the drive; None: there is none.
+    duplicates_field: ClassVar[str | None] = None
+    # Whether a search of a log without a force, in its simulated loop, tries it.
+    without_force: ClassVar[bool] = False
     # Whether it is the law of a spring; on a plant with springs it acts on an elongation.
     of_spring: ClassVar[bool] = False
     # True if only a plant with springs can have it, False if only one without; None: any plant.

@@ -52,7 +52,7 @@ class SearchHints(Drives):
             return False
         if springs and effect.of_spring != (port >= self.bodies(self.joints)):
             return False
-        return not effect.in_drive or self.drive_of(port, drives) is not None
+        return not (effect.in_drive or effect.needs_drive) or self.drive_of(port, drives) is not None
 
     def equivalent_parameter(self, effect: type[Effect], port: int) -> tuple[str, int | None] | None:
         """Return the parameter, and its entry if it is a list, that an effect on a port duplicates."""

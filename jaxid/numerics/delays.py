@@ -1,7 +1,8 @@
-"""Delays of sampled signals, with a derivative by the delay."""
+"""Delays and lags of sampled signals, with a derivative by the delay and by the lag."""
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
@@ -47,3 +48,18 @@ def shifted_hold(signal: Float[Array, "time m"], shift: Array) -> tuple[Array, A
     newer, older = (shifted(signal, jnp.floor(shift) + k) for k in (0, 1))
     lean = 3.0 * part * (1.0 - part) * (newer - older)
     return mean - lean, mean + lean
+
+
+def lagged(signal: Float[Array, "time m"], part: Array) -> Float[Array, "time m"]:
+    """Low-pass a signal: each sample moves the result by a part of its distance; it starts at the first.
+
+    Args:
+        signal: Values at the samples, (time, m).
+        part: Part of the distance, above zero and at most one, one for all columns or one each.
+    """
+
+    def follow(last: Array, now: Array) -> tuple[Array, Array]:
+        new = last + part * (now - last)
+        return new, new
+
+    return jax.lax.scan(follow, jnp.asarray(signal[0], float), signal)[1]

@@ -72,6 +72,33 @@ def sharp_clip(x: Float[Array, "..."], limit: Float[Array, "..."]) -> Float[Arra
     return jnp.where(x > limit, limit, jnp.where(x < -limit, -limit, x))
 
 
+# Width over which the edge of a dead band is rounded in a derivative, relative to the band.
+_EDGE = 0.1
+
+
+@jax.custom_jvp
+def outside(x: Float[Array, "..."], band: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return x where its magnitude is at least the band, else zero.
+
+    The value is exact. Its derivative by the band, an impulse at the edge, is spread over a tenth of the
+    band: summed over the samples of a passage it is that of the time at which the edge is crossed.
+    """
+    return jnp.where(jnp.abs(x) >= band, x, 0.0)
+
+
+@outside.defjvp
+def _outside_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    x, band = primals
+    moved, widened = tangents
+    width = jnp.maximum(_EDGE * band, _TINY)
+    # Slope of tanh((|x| - band) / width) / 2: its integral over |x| is one.
+    impulse = 0.5 / width / jnp.cosh(jnp.clip((jnp.abs(x) - band) / width, -50.0, 50.0)) ** 2
+    edge = x * impulse
+    return outside(x, band), jnp.where(jnp.abs(x) >= band, moved, 0.0) + edge * (
+        jnp.sign(x) * moved - widened
+    )
+
+
 def dead_zone(
     x: Float[Array, "..."], limit: Float[Array, "..."], width: Float[Array, "..."]
 ) -> Float[Array, "..."]:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from jaxid.model.unknowns import Free
     from jaxid.results.result import FitResult
     from jaxid.session import Session
+from jaxid.simulation.sensor_noise import position_noise
 
 
 def parameters_json(
@@ -152,6 +153,7 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
             },
         },
     }
+    out["simulation"] |= _position_floor(session)
     if len(fitted) > 1:
         out["fits"] = {g.name: _of_one(g) for g in fitted}
     if len(others) > 1:
@@ -159,10 +161,21 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
     return out
 
 
-def _band(session: Session) -> float | None:
-    """Return the edge of the band in which forces are compared [Hz]; None for a table, which has no time."""
+def _position_floor(session: Session) -> dict[str, Any]:
+    """Return the noise of the positions that a log without a force is judged by; empty for other logs."""
     log = session.fit.log
-    return None if log.steady is not None else session.recipe.band_hz(log.rate_hz)
+    if not session.machine.unforced(log):
+        return {}
+    floor = position_noise(session.machine, log)[list(log.measured)]
+    return {"noise_floor": one_or_list(floor)}
+
+
+def _band(session: Session) -> float | None:
+    """Return the edge of the band in which forces are compared [Hz]; None if there are none, or no time."""
+    log = session.fit.log
+    if log.steady is not None or session.machine.unforced(log):
+        return None
+    return session.recipe.band_hz(log.rate_hz)
 
 
 def _of_one(gap: Gap) -> dict[str, Any]:
@@ -351,6 +364,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
                 "unit": machine.unit_by_joint("position", None if len(measured) > 1 else measured),
                 "before": _worst(before[judged], "simulation.rms"),
                 "after": _worst(after[judged], "simulation.rms"),
+                **_position_floor(result.session),
             },
         },
         "parameters": {
@@ -410,6 +424,11 @@ def step_json(r: Any, plant: Plant) -> dict[str, Any]:
         "fit": one_or_list(r.fit),
         "validation": one_or_list(r.validation),
     }
+    if r.position_fit is not None:
+        out["simulation"] = {
+            "fit": one_or_list(r.position_fit),
+            "validation": one_or_list(r.position_validation),
+        }
     if step.dropped is not None:
         out["dropped"] = step.dropped.kind
     return out

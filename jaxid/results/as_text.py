@@ -71,6 +71,7 @@ def gap_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[l
     """Return a header, and the disagreement of a model with its logs in force and in position."""
     gap = results.gap_json(session, gaps, floor)
     simulation = gap["simulation"]
+    floor_of_position = [FLOOR, _number(simulation.get("noise_floor")), "", joined(simulation["unit"])]
     forces = [
         ["force", _number(gap["fit"]), _number(gap["validation"]), joined(gap["unit"])],
         ["force, relative", _number(gap["relative"]["fit"]), _number(gap["relative"]["validation"]), ""],
@@ -85,6 +86,7 @@ def gap_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[l
             _number(simulation["validation"]),
             joined(simulation["unit"]),
         ],
+        *([floor_of_position] if "noise_floor" in simulation else []),
     ]
 
 
@@ -157,9 +159,12 @@ def discovery_summary(result: Discovery) -> str:
 def _gap_line(result: FitResult) -> str:
     """Return the force residual on the fitted and the validation logs in one line."""
     gap = results.gap_json(result.session, result.gaps, result.noise_floor)
+    what = "force gap"
+    if "noise_floor" in gap["simulation"]:
+        what, gap = "gap of the simulated position", gap["simulation"]
     others = "" if gap["validation"] is None else f", validation {_number(gap['validation'])}"
-    floor = f"noise floor {_number(gap['noise_floor'])} {gap['unit']}"
-    return f"  force gap: fit {_number(gap['fit'])}{others}, {floor}"
+    floor = f"noise floor {_number(gap['noise_floor'])} {joined(gap['unit'])}"
+    return f"  {what}: fit {_number(gap['fit'])}{others}, {floor}"
 
 
 def _identifiable_combinations(directions: Sequence[dict[str, Any]]) -> list[str]:
@@ -196,7 +201,8 @@ def discovery_table(result: Discovery) -> str:
     lines += [f"experiment: {e['text']}" for e in content["experiments"]]
 
     parameters = _parameters_text(result)
-    lines += ["", aligned(step_rows(content)), "", parameters, *_unidentifiable(result.after), ""]
+    below = [*_unidentifiable(result.after), *_relative(result.after)]
+    lines += ["", aligned(step_rows(content)), "", parameters, *below, ""]
 
     gap = content["gap"]
     position = (
@@ -205,6 +211,11 @@ def discovery_table(result: Discovery) -> str:
     )
     if result.judgement.drifted:
         position = "drifts off in open loop, see above"
+    motion = gap["simulation"]
+    if "noise_floor" in motion:
+        floor = f"{FLOOR} {_number(motion['noise_floor'])} {joined(motion['unit'])}"
+        lines.append(f"simulated position, gap on {gap['on']}: {position} ({floor})")
+        return "\n".join([*lines, *_notes(content["notes"]), *results.reading_lines(result.session)])
     lines.append(
         f"gap on {gap['on']}: {_number(gap['before'])} -> {_number(gap['after'])} {joined(gap['unit'])} "
         f"({FLOOR} {_number(gap['noise_floor'])}); simulated position {position}"
@@ -219,7 +230,10 @@ def step_rows(content: Mapping[str, Any]) -> list[list[str]]:
     Args:
         content: Content of discovery.json.
     """
-    rows = [["step", "force gap, fit", "force gap, validation"]]
+    of_position = any("simulation" in step for step in content["steps"])
+    what = "gap of the simulated position" if of_position else "force gap"
+    unit = joined(content["gap"]["simulation"]["unit"]) if of_position else content["gap"]["unit"]
+    rows = [["step", f"{what}, fit", f"{what}, validation"]]
     for step in content["steps"]:
         place = place_words(step)
         place = f" ({place})" if place else ""
@@ -227,7 +241,8 @@ def step_rows(content: Mapping[str, Any]) -> list[list[str]]:
         if "dropped" in step:
             name = (f"{name}, " if step["added"] else "") + f"- {step['dropped']}"
             name += "" if step["added"] else place
-        rows.append([name, f"{_number(step['fit'])} {content['gap']['unit']}", _number(step["validation"])])
+        left = step["simulation"] if of_position else step
+        rows.append([name, f"{_number(left['fit'])} {unit}", _number(left["validation"])])
     return rows
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxid.case.case import Case, load_case
 from jaxid.case.declared import EffectEntry
-from jaxid.case.tables import ControllerTable, at_start
+from jaxid.case.tables import UNKNOWN_OF_CONTROLLER, ControllerTable, at_start
 from jaxid.case.values import Value
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
@@ -54,6 +54,7 @@ class Findings:
         reference: New guesses of [reference] by key.
         controller: New guesses of [controller] by key and drive.
         added: Effects beside those of the case: the object, its place, and its values.
+        stated: Values that effects beside those of the case have as keys of [controller], by key.
     """
 
     plant: dict[str, dict[Index, float]]
@@ -61,6 +62,7 @@ class Findings:
     reference: dict[str, float]
     controller: dict[str, dict[Index, float]]
     added: tuple[tuple[Effect, tuple[str, int] | None, dict[str, Value]], ...]
+    stated: dict[str, Value | tuple[Value | float, ...]]
 
 
 def found_case(result: FitResult) -> Case:
@@ -100,9 +102,9 @@ def found_case(result: FitResult) -> Case:
 def _with_controller(case: Case, findings: Findings) -> ControllerTable | None:
     """Return [controller] with new guesses."""
     table = case.controller
-    if table is None or not findings.controller:
+    if table is None or not (findings.controller or findings.stated):
         return table
-    unknown = dict(table.unknown)
+    unknown = {**table.unknown, **findings.stated}
     for name, guesses in findings.controller.items():
         for index, guess in guesses.items():
             unknown[name] = _with_guess(unknown[name], index, guess)
@@ -139,13 +141,28 @@ def _findings(result: FitResult) -> Findings:
             case (str(name),) if known:
                 plant.setdefault(name, {})[f.index] = guess
 
+    fields = {k: machine.plant.effects[k].controller_field for k in added}
+    keys = {k: name for k, name in fields.items() if name in UNKNOWN_OF_CONTROLLER}
     return Findings(
         plant,
         effects,
         reference,
         controller,
-        tuple(_added(machine.plant, k, values) for k, values in added.items()),
+        tuple(_added(machine.plant, k, values) for k, values in added.items() if k not in keys),
+        _stated(machine.plant, len(machine.gain), {k: (name, added[k]) for k, name in keys.items()}),
     )
+
+
+def _stated(
+    plant: Any, drives: int, found: Mapping[int, tuple[str | None, dict[str, Value]]]
+) -> dict[str, Value | tuple[Value | float, ...]]:
+    """Return the keys of [controller] that state effects, by the numbers of these; other drives have zero."""
+    out: dict[str, list[Value | float]] = {}
+    for k, (name, values) in found.items():
+        (value,) = values.values()
+        drive = plant.drive_of(plant.effects[k].port, drives)
+        out.setdefault(str(name), [0.0] * drives)[drive] = value
+    return {name: values[0] if drives == 1 else tuple(values) for name, values in out.items()}  # pyright: ignore[reportReturnType]  # a Value
 
 
 def _by_place(rows: Iterable[tuple[Free, float, bool]]) -> Iterator[tuple[Free, float, bool]]:
@@ -269,9 +286,11 @@ def _put_guesses(tables: Any, case: Case, findings: Findings) -> None:
             _put(tables["effects"][number], name, guesses, places, case.effects[number].parameters[name])
     for key, guess in findings.reference.items():
         tables["reference"][key]["guess"] = guess
-    if findings.controller and "controller" not in tables:
+    if (findings.controller or findings.stated) and "controller" not in tables:
         # The servos of a robot's file stand in no table of the case.
         tables["controller"] = copy.deepcopy(case.plant.defaults["controller"])
+    for key, value in findings.stated.items():
+        tables["controller"][key] = _inline(value)
     for key, guesses in findings.controller.items():
         assert case.controller is not None, "its unknowns are estimated"
         values = case.controller.unknown[key]
@@ -284,6 +303,19 @@ def _put_guesses(tables: Any, case: Case, findings: Findings) -> None:
             len(values) if several else 1,
             values if several else (values,),
         )
+
+
+def _inline(value: Value | tuple[Value | float, ...]) -> Any:
+    """Return a value with a guess as TOML writes it within a line, or a list of them."""
+    import tomlkit
+
+    if isinstance(value, tuple):
+        listed = tomlkit.array()
+        listed.extend([v if isinstance(v, float) else _inline(v) for v in value])
+        return listed
+    table = tomlkit.inline_table()
+    table.append("guess", value.guess)
+    return table
 
 
 def _of_file(case: Case, findings: Findings, declared: int) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.controllers import Controller, Tick
+from jaxid.controllers import Controller, Tick, with_effects
 from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, step, vector_field
 from jaxid.model.plant import Plant
@@ -211,6 +211,7 @@ def closed_loop(
     """
     sensor, n = Sensor() if sensor is None else sensor, position.size
     driven = plant.driven(position.size)
+    controller = with_effects(controller, plant, drive.gain.size)
     path = controller.path(reference)
     first = jax.tree.map(lambda x: x[0], path)
     memory = controller.start(Tick(position, first, driven), velocity, path)

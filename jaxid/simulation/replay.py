@@ -12,7 +12,7 @@ import scipy.signal
 from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
-from jaxid.controllers import PID, Controller
+from jaxid.controllers import PID, Controller, with_effects
 from jaxid.dynamics.hidden_joints import resting
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
@@ -212,6 +212,7 @@ def _in_motion(machine: Machine, log: Log, every: int, disturbance: np.ndarray |
         return controller
     # One shape for all logs, so that they share compiled code.
     controller = replace(controller, integral=jnp.zeros(log.force.shape[1]))
+    law = with_effects(controller, machine.plant, log.force.shape[1])
     if log.reference is None or every > 1 or not all(log.measured):
         return controller
     velocity, first = start_velocity(log), min(_FIRST, log.samples)
@@ -221,7 +222,7 @@ def _in_motion(machine: Machine, log: Log, every: int, disturbance: np.ndarray |
     driven, shape = machine.plant.driven(log.position.shape[1]), log.force[:first].shape
     reference, extra = (np.broadcast_to(x[:first], shape) for x in (log.reference, disturbance))
     readings = (jnp.asarray(x) for x in (log.position[:first], reference, extra, velocity))
-    made = np.asarray(commands(controller, driven, *readings))
+    made = np.asarray(commands(law, driven, *readings))
     inside = np.ones(shape, bool)
     if controller.limit is not None:
         inside = np.abs(log.force[:first]) < (1 - 1e-6) * np.asarray(controller.limit)

@@ -46,7 +46,7 @@ def needed_steps(machine: Machine, log: Log) -> int:
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
     q, u = log.filled[picks], log.force[picks] * np.asarray(machine.gain)
-    steps = float(_fastest(machine.plant, q, u)) * period / _FINE
+    steps = float(fastest_rate(machine.plant, q, u)) * period / _FINE
     if not np.isfinite(steps):
         raise TooStiffError(
             "the plant's forces have no finite slope where the log begins to move",
@@ -72,7 +72,7 @@ def _rounded(steps: int) -> int:
 
 
 @kept_jit
-def _fastest(plant: Plant, q: Array, u: Array) -> Array:
+def fastest_rate(plant: Plant, q: Array, u: Array) -> Array:
     """Return the fastest rate of the plant without dry friction, linearised at rest at some positions."""
 
     def rate(q: Array, u: Array) -> Array:

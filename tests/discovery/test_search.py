@@ -9,6 +9,7 @@ import pytest
 
 from jaxid.commands.discover import discover
 from jaxid.effects import EFFECTS
+from tests.discovery.test_without_force import HIDDEN
 from tests.support.axis_log import log_of
 from truth.axis import machines
 from truth.axis.cases import case_text, write_case
@@ -44,7 +45,13 @@ ELSEWHERE = {
         "discovery/test_stage_search.py",
         "test_the_friction_of_the_table_is_named_both_ways",
     ),
+    "command_delay": (
+        "discovery/test_without_force.py",
+        "test_a_missing_delay_is_named_and_put_into_the_controller",
+    ),
 }
+# Effects that only a log without a force is searched for, in `discovery/test_without_force.py`.
+IN_LOOP = {"command_lag", "dead_band", "load_friction"}
 
 
 # The damping by a drive's voltage is known from its data; as a force it is viscous friction.
@@ -53,7 +60,8 @@ NOT_SEARCHED_FOR = {"back_emf_damping"}
 
 def test_every_effect_has_a_case():
     searched_for = {k for k in EFFECTS if ":" not in k} - NOT_SEARCHED_FOR
-    assert set(SEARCH_CASES) | set(ELSEWHERE) == searched_for
+    assert set(SEARCH_CASES) | set(ELSEWHERE) | IN_LOOP == searched_for
+    assert set(HIDDEN) >= IN_LOOP
     assert not set(SEARCH_CASES) & set(ELSEWHERE)
 
 

@@ -28,7 +28,11 @@ NAMING = {
     "first_case": "it writes the friction of a first case",
 }
 # Files that may, with the reason.
-NAMING_FILES = {"case/tree.py": "damping, dry friction and springs of a robot's file become effects"}
+NAMING_FILES = {
+    "case/tables.py": "a dead band is a key of [controller] too",
+    "case/user_faults.py": "a method of effects has the name of one",
+    "case/tree.py": "damping, dry friction and springs of a robot's file become effects",
+}
 # Modules that import the class of an effect, because they add one themselves or ask for its equivalent.
 ADDING = {
     "build.py": {"BackEmfDamping"},

@@ -68,14 +68,18 @@ def check_gradient(both, row: Row) -> None:
     np.testing.assert_array_less(np.linalg.norm(jacobian - expected, axis=0), 1e-3 * norm)
 
 
-@each_row
+# The command jumps at the edge of a dead band: see test_dead_band.
+@pytest.mark.parametrize("name", [n for n, row in ROWS.items() if row.kind != "dead_band"])
 def test_gradient_through_the_smoothed_loop(name):
     row = ROWS[name]
     check_gradient(loop_with_jacobian(row, set_valued=False, substeps=substeps_for(row)), row)
 
 
-# Break-away jumps where sliding starts: the only one without a gradient there.
-@pytest.mark.parametrize("name", [n for n, row in ROWS.items() if row.kind != "static_friction"])
+# Break-away jumps where sliding starts, and the command at the edge of a dead band.
+JUMP = ("static_friction", "dead_band")
+
+
+@pytest.mark.parametrize("name", [n for n, row in ROWS.items() if row.kind not in JUMP])
 def test_gradient_through_the_loop_that_sticks(name):
     check_gradient(exact_loop(name, 4), ROWS[name])
 
@@ -111,10 +115,10 @@ def distance(name: str, substeps: int) -> float:
 
 
 # Of the stroke. Dry friction turns exactly within a step where its level is constant; one that moves with
-# speed is taken halfway (second order), one that drifts at the step's start (first). Under a delay off the
-# grid a line stands in a tick for two values (third order in it). |v| is rounded over 1 mm/s, the corners of
-# the limit by voltage, which speed crosses within a tick, over a thousandth of it. All else is smooth: the
-# stepper's second order at 5 us.
+# speed is taken halfway (second order), one that drifts at the step's start (first), and so is one that
+# jumps with the direction where the joint turns. Under a delay off the grid a line stands in a tick for two
+# values (third order in it). |v| is rounded over 1 mm/s, the corners of the limit by voltage, which speed
+# crosses within a tick, over a thousandth of it. All else is smooth: the stepper's second order at 5 us.
 CLOSE = {
     "input_delay": 1e-6,
     "asymmetric_viscous": 1e-6,
@@ -124,6 +128,7 @@ CLOSE = {
     "velocity_hysteresis": 2e-8,
     "friction_drift": 1e-6,
     "voltage_limit": 2e-8,
+    "load_friction": 1e-5,
 }
 
 
@@ -143,7 +148,13 @@ def test_one_step_a_tick_turns_where_friction_does(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "part"), [("stribeck_friction", 0.1), ("velocity_hysteresis", 0.1), ("friction_drift", 0.4)]
+    ("name", "part"),
+    [
+        ("stribeck_friction", 0.1),
+        ("velocity_hysteresis", 0.1),
+        ("friction_drift", 0.4),
+        ("load_friction", 0.4),
+    ],
 )
 def test_distance_to_the_truth_falls_with_the_step(name, part):
     # Second order, and first, as said above: a sixteenth and a fourth.

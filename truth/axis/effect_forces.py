@@ -121,6 +121,22 @@ ROWS: dict[str, Row] = {
     "actuator_lag": Row("actuator_lag", {"time_constant": 5e-3}, lambda x: x.z, own=70.0),
     # the delay is in the look-up of u, which tests of `interval_forces` cover
     "input_delay": Row("input_delay", {"delay": 2.4e-3}, lambda x: x.u),
+    # On the reference and on the error in front of the law: tests of the loop cover them.
+    "command_delay": Row("command_delay", {"delay": 2.4e-3}, lambda x: x.u),
+    "command_lag": Row("command_lag", {"time_constant": 6e-3}, lambda x: x.u),
+    "dead_band": Row("dead_band", {"width": 1e-3}, lambda x: x.u),
+    "load_friction of one coefficient": Row(
+        "load_friction",
+        {"coefficient": 0.25},
+        lambda x: x.u - 0.25 * abs(x.u) * sign(x.v),
+        dry=True,
+    ),
+    "load_friction": Row(
+        "load_friction",
+        {"coefficient": 0.15, "back": 0.4},
+        lambda x: x.u - (0.4 if x.u * x.v < 0 else 0.15) * abs(x.u) * sign(x.v),
+        dry=True,
+    ),
     "saturation": Row("saturation", {"limit": 150.0}, lambda x: clip(x.u, 150.0)),
     "voltage_limit": Row(
         "voltage_limit",

@@ -48,6 +48,8 @@ class Physics(NamedTuple):
     rising_forth: float = 0.0  # N, above Coulomb while speeding up forwards
     rising_back: float = 0.0  # N, backwards
     rising_velocity: float = 1.0  # m/s
+    gear: float = 0.0  # dry friction over the drive's force, while the drive gives power
+    gear_back: float = 0.0  # while the load does
     dahl_stiffness: float = 0.0  # N/m
     dahl_level: float = 1.0  # N
     drift: float = 0.0  # 1/s, of every dry level
@@ -74,6 +76,7 @@ class Law(NamedTuple):
     coulomb: float = 0.0  # fed forward, unit of command
     viscous: float = 0.0
     inertia: float = 0.0
+    dead_band: float = 0.0  # position error that is taken for none
 
 
 @njit(cache=True)
@@ -125,7 +128,15 @@ def drift_scale(p, t):
 
 
 @njit(cache=True)
-def kick(p, v, w, h, net, scale):
+def gear_level(p, side, drive, scale):
+    """Return the dry friction of a gear that transmits `drive` [N] and slides to `side`; 0 is at rest."""
+    if p.gear == 0.0 and p.gear_back == 0.0:
+        return 0.0
+    return scale * (p.gear_back if drive * side < 0.0 else p.gear) * abs(drive)
+
+
+@njit(cache=True)
+def kick(p, v, w, h, net, scale, drive):
     """Return the velocity after h [s] under a constant force, dry friction solved exactly.
 
     Slides until it stops; the rest of h is spent at rest if friction can hold |net|, else it leaves
@@ -135,7 +146,7 @@ def kick(p, v, w, h, net, scale):
     slip = slip_level(p, w, scale)
     if v != 0.0:
         side = 1.0 if v > 0.0 else -1.0
-        pull = side * net - slip
+        pull = side * net - slip - gear_level(p, side, drive, scale)
         if pull > 0.0:
             pull = max(pull - rising_level(p, side, w, scale), 0.0)
         rate = side * pull / p.mass
@@ -145,9 +156,12 @@ def kick(p, v, w, h, net, scale):
         h += v / rate  # rate opposes v here: v / rate is minus the time to stop
     side = 1.0 if net > 0.0 else -1.0
     hold = p.coulomb + p.stribeck + p.static
-    if abs(net) <= scale * hold + rising_level(p, side, 0.0, scale):
+    gear = gear_level(p, side, drive, scale)
+    if abs(net) <= scale * hold + rising_level(p, side, 0.0, scale) + max(
+        gear, gear_level(p, 0.0, drive, scale)
+    ):
         return 0.0
-    return h * side * max(abs(net) - slip - rising_level(p, side, w, scale), 0.0) / p.mass
+    return h * side * max(abs(net) - slip - gear - rising_level(p, side, w, scale), 0.0) / p.mass
 
 
 @njit(cache=True)
@@ -190,10 +204,10 @@ def advance(p, bursts, q, v, z, lagged, target, t, h):
     lagged = target + (middle - target) * decay
     drive = min(max(middle, -p.clip), p.clip)
     rest = outside_force(p, bursts, t, h) + position_force(p, q, z)
-    force = supplied(p, drive, v) + p.weight + rest
-    middle = kick(p, v, abs(v), half, force + velocity_force(p, v), scale)
-    force = supplied(p, drive, middle) + p.weight + rest
-    v = kick(p, v, abs(middle), h, force + velocity_force(p, middle), scale)
+    given = supplied(p, drive, v)
+    middle = kick(p, v, abs(v), half, given + p.weight + rest + velocity_force(p, v), scale, given)
+    given = supplied(p, drive, middle)
+    v = kick(p, v, abs(middle), h, given + p.weight + rest + velocity_force(p, middle), scale, given)
     z = dahl(p, z, half * v, scale)
     q += half * v
     return q, v, z, lagged
@@ -209,8 +223,9 @@ def acceleration(p, bursts, q, v, z, drive, t):
     )  # chosen: 1 ns, short against a step, long against the rounding of t
     side = v if v != 0.0 else net
     pull = math.copysign(1.0, side) * net - slip_level(p, abs(v), scale)
+    pull -= gear_level(p, math.copysign(1.0, side), drive, scale)
     more = rising_level(p, side, abs(v), scale)
-    hold = scale * (p.coulomb + p.stribeck + p.static)
+    hold = scale * (p.coulomb + p.stribeck + p.static) + gear_level(p, 0.0, drive, scale)
     if v == 0.0 and abs(net) <= hold + more:
         return 0.0
     return math.copysign(1.0, side) * (max(pull - more, 0.0) if pull > 0.0 else pull) / p.mass
@@ -242,6 +257,8 @@ def command(law, k, reference, reading, memory, period):
     """Return the command at tick k from the readings up to k; before the log all readings equal the first."""
     now, before = reading[k], reading[max(k - law.average, 0)]
     error = reference[k] - now
+    if abs(error) < law.dead_band:
+        error = 0.0
     speed = (now - before) / (law.average * period)
     last = max(k - 1, 0)
     aim = (reference[k] - reference[last]) / period

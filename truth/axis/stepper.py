@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import scipy.signal
 
 from truth.axis import kernel
 
@@ -51,7 +52,10 @@ EFFECTS = {
     "voltage_limit": {"stall": "stall", "velocity": "no_load"},
     "added_mass": {"mass": "mass"},
     "friction_drift": {"rate": "drift"},
+    "load_friction": {"coefficient": "gear", "back": "gear_back"},
 }
+# Effects between the reference and the law, with their parameter.
+ON_COMMAND = {"command_delay": "delay", "command_lag": "time_constant", "dead_band": "width"}
 KINDS = {
     "open_loop": kernel.OPEN,
     "cascade_pd": kernel.CASCADE_PD,
@@ -153,11 +157,15 @@ def physics(machine: Machine) -> kernel.Physics:
         coulomb["level"] = coulomb.pop("friction_coefficient") * (machine.inertia + added) * STANDARD_GRAVITY
     fields = {}
     for kind, values in effects.items():
+        if kind in ON_COMMAND:
+            continue
         if kind not in EFFECTS:
             raise ValueError(f"The stepper has no effect {kind!r}; it has {sorted(EFFECTS)}.")
         names = EFFECTS[kind]
         if kind == "velocity_hysteresis":  # the same both ways where nothing else is said
             values.setdefault("level_negative", values["level"])
+        if kind == "load_friction":
+            values.setdefault("back", values["coefficient"])
         if set(values) != set(names):
             raise ValueError(f"{kind} takes {sorted(names)}, got {sorted(values)}.")
         fields |= {names[name]: float(value) for name, value in values.items()}
@@ -183,6 +191,21 @@ def control_law(loop: Loop) -> kernel.Law:
     }
     average, windup = int(loop.velocity_average), bool(loop.anti_windup)
     return kernel.Law(kind=KINDS[loop.kind], average=average, anti_windup=windup, **gains, **pulses)
+
+
+def reached(reference: np.ndarray, machine: Machine, rate: float) -> np.ndarray:
+    """Return what reaches the law of a reference [m], behind the delay and the lag of the command.
+
+    The delayed reference is joined by lines; the lag is the low-pass y[k] = a r[k] + (1 - a) y[k-1] that has
+    settled at the first reference, with a = h / (T + h).
+    """
+    delay, constant = (
+        machine.effects.get(kind, {}).get(ON_COMMAND[kind], 0.0) for kind in ("command_delay", "command_lag")
+    )
+    t = np.arange(len(reference)) / rate
+    out = np.interp(t - delay, t, reference)
+    a = 1.0 / (1.0 + constant * rate)
+    return scipy.signal.lfilter([a], [1.0, a - 1.0], out - out[0]) + out[0]
 
 
 def first_samples(values: np.ndarray | None, count: int, what: str) -> np.ndarray:
@@ -243,14 +266,17 @@ def simulate(
     is_open = loop.kind == "open_loop"
     u = first_samples(loop.input, count, "input") if is_open else np.zeros(count)
     reference = np.zeros(count) if is_open else first_samples(loop.reference, count, "reference")
+    width = machine.effects.get("dead_band", {}).get("width", 0.0)
+    law = control_law(loop)._replace(dead_band=float(width))
     random = np.random.default_rng(seed)
     noise = sensor.position_noise * random.standard_normal(count)
     force_noise = sensor.force_noise * random.standard_normal(count)
     bursts = np.array(machine.bursts, dtype=float).reshape(-1, 3)
     reading, truth = np.zeros(count), np.zeros((count, 4))
     kernel.run(
-        physics(machine), control_law(loop), u, is_open and loop.hold == "linear",
-        reference, bursts, noise, float(sensor.position_resolution), 1.0 / rate, float(step),
+        physics(machine), law, u, is_open and loop.hold == "linear",
+        reached(reference, machine, rate), bursts, noise, float(sensor.position_resolution),
+        1.0 / rate, float(step),
         float(initial_position), float(initial_velocity), reading, truth, np.zeros(2),
     )  # fmt: skip
     log = {

@@ -50,12 +50,12 @@ def advance(masses, springs, q, v, drive, pull, h):
     for i in range(q.size):
         p = masses[i]
         force = drive[i] + pull[i] + axis.position_force(p, q[i], 0.0) + axis.velocity_force(p, v[i])
-        middle[i] = axis.kick(p, v[i], abs(v[i]), half, force, 1.0)
+        middle[i] = axis.kick(p, v[i], abs(v[i]), half, force, 1.0, drive[i])
     pull_of_springs(springs, q, middle, pull)
     for i in range(q.size):
         p, mid = masses[i], middle[i]
         force = drive[i] + pull[i] + axis.position_force(p, q[i], 0.0) + axis.velocity_force(p, mid)
-        v[i] = axis.kick(p, v[i], abs(mid), h, force, 1.0)
+        v[i] = axis.kick(p, v[i], abs(mid), h, force, 1.0, drive[i])
         q[i] += half * v[i]
 
 

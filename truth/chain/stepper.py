@@ -24,6 +24,7 @@ MASS_EFFECTS = (
     "viscous_friction", "coulomb_friction", "static_friction", "stribeck_friction",
     "asymmetric_viscous", "quadratic_drag", "cubic_friction", "quartic_friction",
     "constant_force", "cogging", "velocity_hysteresis", "actuator_lag", "actuator_gain", "added_mass",
+    "load_friction",
 )  # fmt: skip
 Place = tuple[str, int]
 _PHYSICS = np.dtype([(name, float) for name in Physics._fields])

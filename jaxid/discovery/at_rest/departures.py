@@ -216,7 +216,7 @@ def _applied_command(machine: Machine, log: Log) -> np.ndarray:
     extra = disturbance_at(machine.disturbance, log.time, log)
     arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
     driven = machine.plant.driven(log.position.shape[1])
-    made = np.asarray(commands(machine.controller, driven, *arrays))
+    made = np.asarray(commands(machine.law, driven, *arrays))
     size = np.sqrt(np.mean(log.force**2, axis=0))
     stated = machine.sensor.force_noise
     noise = 0.0 if stated is None else np.asarray(stated)

@@ -260,7 +260,7 @@ class Loop:
         plant = with_numerical_damping(self.superset.machine.plant, jnp.asarray(log.filled[0]), log.period)
         plant = plant.smoothed(p.sharpnesses[-1])
         args = (p.replay, self.superset.machine.parameters.places, plant, p.measured, p.weight, p.on)
-        e, columns = _columns(*args, theta, directions)
+        e, columns = loop_columns(*args, theta, directions)
 
         slope = np.zeros((self.residual.size, len(c.index)))
         slope[: self.samples] = np.asarray(columns)[:, : len(c.index)] / self.sigma
@@ -386,7 +386,7 @@ def _follows(effect: type[Effect]) -> bool:
 
 
 @kept_jit
-def _columns(
+def loop_columns(
     replay: Replay,
     places: tuple,
     plant: Plant,

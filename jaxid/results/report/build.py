@@ -269,12 +269,14 @@ def _view(run: OpenedLog, before: Gap | None, after: Gap, joint: int, joints: in
 def search_step(r: Round) -> SearchStep:
     """Return one step of a search as it is drawn."""
     step = r.step
+    of_position = r.position_fit is not None
+    fit, validation = (r.position_fit, r.position_validation) if of_position else (r.fit, r.validation)
     added = step.added.candidate if step.added else None
     return SearchStep(
         added=added.label if added else None,
         dropped=step.dropped.label if step.dropped else None,
-        gap_fit=float(np.max(r.fit)),
-        gap_validation=None if r.validation is None else float(np.max(r.validation)),
+        gap_fit=float(np.max(fit)),
+        gap_validation=None if validation is None else float(np.max(validation)),
         candidates=tuple(
             CandidateScore(s.candidate.label, s.evidence, s.candidate is added) for s in step.scores
         ),

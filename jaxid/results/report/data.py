@@ -75,7 +75,8 @@ class SearchStep:
     Args:
         added: Effect added in this step, or None.
         dropped: Effect taken out again in this step, or None.
-        gap_fit: RMS force residual of the model after this step, on the fit log.
+        gap_fit: RMS force residual of the model after this step, on the fit log; that of the position
+            of a log without a force.
         gap_validation: RMS force residual on the validation log, or None.
         candidates: Scores of all effects tried in this step.
         threshold: Evidence that an effect needs to be added [nats].

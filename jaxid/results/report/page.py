@@ -45,6 +45,7 @@ def render(data: ReportData) -> str:
     entries = [_view_entry(data, view, i) for i, view in enumerate(data.views)]
     telling = _telling(data, main)
     missing = [row.name for row in data.parameters if not row.identifiable]
+    by_position = "noise_floor" in (data.gap.get("simulation") or {})
     return filled(
         "page.html",
         data=data,
@@ -68,7 +69,8 @@ def render(data: ReportData) -> str:
         missing=missing,
         many_missing=first_page.many_unidentifiable(len(data.unidentifiable), len(missing)),
         steps=tables.step_lines(data),
-        force_unit=pretty_unit(str(data.units["force"])),
+        step_unit=pretty_unit(str(data.units["position" if by_position else "force"])),
+        by_position=by_position,
         rankings=_rankings(data),
         where=tables.where_lines(data),
         notes=[tables.unbroken(note) for note in data.notes],

@@ -333,11 +333,14 @@ def gap_rows(data: ReportData) -> list[GapRow]:
     gap = data.gap
     motion = gap.get("simulation") or {}
     force = {"quantity": "force", "unit": gap.get("unit"), "floor": gap.get("noise_floor")}
-    position = {"quantity": SIMULATED, "unit": motion.get("unit")}
+    position = {"quantity": SIMULATED, "unit": motion.get("unit"), "floor": motion.get("noise_floor")}
     if "before" in gap or "after" in gap:
         log = gap.get("on") or "fit"
-        rows = _by_joint(log=log, before=gap.get("before"), after=gap.get("after"), **force)
-        rows += _other_log(data, log, force)
+        # A log without a force has no gap in it, and states the noise of its positions.
+        rows = []
+        if "noise_floor" not in motion:
+            rows = _by_joint(log=log, before=gap.get("before"), after=gap.get("after"), **force)
+            rows += _other_log(data, log, force)
         both = {"before": motion.get("before"), "after": motion.get("after")}
         rows += _by_joint(log=log, **both, **position)
         # A table of steady speeds has no position to simulate.

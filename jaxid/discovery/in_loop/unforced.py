@@ -1,0 +1,219 @@
+"""Search for missing effects in logs of a loop without a force, by the positions of the simulated loop.
+
+It is the search of `jaxid.discovery.search` with other evidence: in place of forces, the position of the
+simulated loop, in which every candidate is linearised at the fitted parameters and refitted if it is
+promising. Effects that act on the command and on the error of the controller take part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from jaxid.discovery.final import final_machine
+from jaxid.discovery.in_loop.positions import LoopSamples, LoopSearch, PositionDomain
+from jaxid.discovery.result import Discovery, Round
+from jaxid.discovery.search import Step
+from jaxid.discovery.superset import build_candidate_model
+from jaxid.discovery.where import Where
+from jaxid.errors import InputError
+from jaxid.estimators import steps_of
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.output_error import output_error_steps
+from jaxid.estimators.simulated_output import choose_numerics
+from jaxid.estimators.unforced import scale_group, with_free_scale, without
+from jaxid.gap import Gap, gaps
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
+from jaxid.machine import Machine
+from jaxid.model.effect import Effect
+from jaxid.numerics.lanes import run_alone
+from jaxid.numerics.precision import NoiseModel
+from jaxid.results.verdict.completeness import position_residuals
+from jaxid.session import Session
+from jaxid.simulation.sensor_noise import position_noise
+
+UNSEEN = "a log without a force is compared in the simulated loop, which follows no jump at break-away"
+# Samples of the window in which the residual is loudest, as a part of the log.
+_WINDOW = 0.02
+
+
+def explore_unforced(session: Session, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
+    """Run `discover` for logs without a force.
+
+    Args:
+        session: Case and logs.
+        max_effects: Largest number of effects to add.
+        progress: Called with a line of text at every stage.
+
+    Raises:
+        InputError: If there are several fitted logs, a validation log has values of its own, or the loop
+            cannot be simulated.
+    """
+    session.need_one_log("discover without a force")
+    if any(run.own is not None for run in session.validations):
+        what = "a search without a force takes no values of a log of its own"
+        raise InputError(what, where=session.case.where, hint="leave `set` out of [[validation]]")
+    progress("fitting the declared model")
+    before = run_alone(steps_of("output_error", session))
+    fitted, base = _at_scale(before)
+    search = _search(session, fitted, progress)
+    steps = search.run(max_effects)
+    alternatives = search.alternatives(steps)
+    final, effects = final_machine(fitted, search, alternatives, steps)
+    progress("refitting in simulation")
+    after = _refitted(session, final, base) if effects else before
+
+    progress("simulating")
+    old = gaps(before.machine, session.runs)
+    new = gaps(after.machine, session.runs) if effects else old
+    verdict = "found" if effects else _without_effects(session, before, old)
+    return Discovery(
+        session=session,
+        verdict=verdict,
+        where=None if verdict == "nothing_missing" else _where(session.fit.log, old[0]),
+        effects=effects,
+        rounds=_rounds(search, steps, old, new),
+        before=before,
+        after=after,
+        gaps_before=old,
+        gaps_after=new,
+        noise_floor=np.full(session.machine.plant.joints, np.nan),
+        unseen=UNSEEN,
+    )
+
+
+def searched(session: Session, machine: Machine) -> list[type[Effect]]:
+    """Return the effects that a search without a force tries, those that add a spring last.
+
+    They are those that the case limits it to, or else the ones that say so and those that it asks for.
+    """
+    from jaxid.effects import EFFECTS
+
+    case = session.case
+    asked = {cls.kind for cls in case.candidates}
+    kinds = [
+        cls
+        for kind, cls in EFFECTS.items()
+        if (kind in case.kinds if case.kinds else cls.without_force or kind in asked)
+    ]
+    followed = [c for c in (*kinds, *case.own_effects) if c.break_away_level is None and not c.opens_spring]
+    law = machine.controller
+    apart = [c for c in followed if c.duplicates_field is None or getattr(law, c.duplicates_field) is None]
+    return sorted(apart, key=lambda cls: cls.adds_spring)
+
+
+def _at_scale(estimate: Estimate) -> tuple[Machine, int | None]:
+    """Return a fitted machine with the unknown held that gives the scale, and its index; None without."""
+    relative = estimate.details.get("relative")
+    if relative is None:
+        return estimate.machine, None
+    base = estimate.machine.parameters.names.index(relative["to"])
+    return without(estimate.machine, base), base
+
+
+def _search(session: Session, machine: Machine, progress: Callable[[str], None]) -> LoopSearch:
+    """Return the search for the effects that a fitted machine lacks."""
+    log = session.fit.log
+    data = _with_command(session, machine)
+    superset = build_candidate_model(machine, data, searched(session, machine))
+    at_fit = superset.machine
+    numerics = choose_numerics(machine, log)
+    period = log.period if machine.controller is None else machine.controller.period
+    floor = position_noise(machine, log)
+    logs = (session.fit, *session.validations)
+    return LoopSearch(
+        superset,
+        data,
+        floor,
+        tuple(NoiseModel(np.zeros(0), float(s) if s > 0 else 1.0) for s in floor),
+        tuple(run.data for run in session.validations),
+        progress,
+        positions=PositionDomain.of(superset, period, numerics),
+        logs=tuple(LoopSamples.of(run.machine(at_fit), run.log, numerics) for run in logs),
+    )
+
+
+def _with_command(session: Session, machine: Machine) -> Prepared:
+    """Return the prepared log with the simulated force of the drives, which gives the scale of effects."""
+    data = session.fit.data
+    (gap,) = gaps(machine, (session.fit,))
+    if gap.simulation is None or gap.simulation.command is None:
+        raise InputError(
+            "the simulated loop diverges at the values that fit best",
+            where=session.case.where,
+            hint="check guesses, gains and the sign of the reference",
+        )
+    return replace(data, force=gap.simulation.command * machine.gain, moving=np.ones_like(data.moving))
+
+
+def _refitted(session: Session, final: Machine, base: int | None) -> Estimate:
+    """Refit a machine with what was found, from its values; the scale stays free if nothing gives it."""
+    stated, log = session.case.output_error, session.fit.log
+    demands = session.case.identification
+    held = run_alone(
+        output_error_steps(final, log, minimiser=stated.minimiser, hessian=demands.hessian, start=None)
+    )
+    if base is None:
+        return held
+    free = session.machine.parameters.free[base]
+    parameters = final.parameters.free
+    whole = replace(final.parameters, free=(*parameters[:base], free, *parameters[base:]))
+    machine = final.with_plant(final.plant, whole)
+    return with_free_scale(held, machine, scale_group(machine, log), base)
+
+
+def _without_effects(session: Session, estimate: Estimate, found: tuple[Gap, ...]) -> str:
+    """Return the verdict if nothing was added: whether what is left of the fitted log is noise."""
+    left = position_residuals(estimate.machine, session.fit, found[0].simulation)
+    return "unexplained" if any(r.complete is False for r in left) else "nothing_missing"
+
+
+def _rounds(
+    search: LoopSearch, steps: list[Step], old: tuple[Gap, ...], new: tuple[Gap, ...]
+) -> tuple[Round, ...]:
+    """Return the steps with the RMS of the position that each leaves, on the fitted and validation logs."""
+    none = np.full(search.samples.moving.shape[1], np.nan)
+
+    def left(samples: LoopSamples, theta: np.ndarray) -> np.ndarray:
+        e = np.where(samples.moving, search.domain.evaluate(samples, theta, ())[0], np.nan)
+        return np.sqrt(np.nanmean(e**2, axis=0))
+
+    out = []
+    for step in steps:
+        fit, *others = (left(samples, step.theta) for samples in search.logs)
+        worst = np.max(others, axis=0) if others else None
+        out.append(Round(step, none, None if worst is None else none, fit, worst))
+    return tuple(out)
+
+
+def _where(log: Log, gap: Gap) -> Where | None:
+    """Return the time in which the position that the declared model leaves is largest."""
+    if gap.simulation is None:
+        return None
+    e = np.nan_to_num(log.position - gap.simulation.position)
+    window = max(10, round(_WINDOW * log.samples))
+    squares = np.square(e)
+    joint = int(np.argmax(np.sum(squares, axis=0)))
+    power = np.convolve(squares[:, joint], np.ones(window), "valid")
+    k = int(np.argmax(power))
+    begin, end = (float(log.time[i] - log.time[0]) for i in (k, k + window - 1))
+    none = np.zeros(0)
+    at = f"joint {joint + 1}: " if e.shape[1] > 1 else ""
+    return Where(
+        joint=joint + 1,
+        variable="time",
+        region=(begin, end),
+        intervals=((begin, end),),
+        text=f"{at}the simulated position is farthest from the log between {begin:.3g} and {end:.3g} s",
+        explained=float(power[k] / max(np.sum(squares[:, joint]), 1e-300)),
+        evidence=0.0,
+        threshold=0.0,
+        clear=True,
+        x=none,
+        mean=none,
+        low=none,
+        high=none,
+    )

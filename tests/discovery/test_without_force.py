@@ -1,0 +1,139 @@
+"""What logs of a loop without a force lack, found in the simulated loop; logs by the exact stepper."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.errors import InputError
+from tests.estimators.test_unforced import CASE, DELAY, FREE, TRUE, log
+from truth.axis.machines import Setup, moves, multisine
+from truth.axis.stepper import Loop, Machine, Sensor
+
+COULOMB = '[[effects]]\nkind = "coulomb_friction"\nlevel = { guess = 0.1 }\n'
+SECONDS, RATE = 4.0, 500.0
+
+
+def short(effects: dict, seed: int = 0, seconds: float = SECONDS) -> dict[str, np.ndarray]:
+    """A servo of 4096 counts in a loop of 500 Hz, with its force `u`, which a case may leave out."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    asked = moves(t, [0.0, 0.6, -0.4, 0.9], [2.0, 4.0, 1.0, 3.0], 40.0, rest=0.2)
+    asked += multisine(t, [0.7, 1.9, 3.1], 0.15, seed)
+    machine = Machine(2e-3, {"viscous_friction": {"coefficient": 4e-3}, **effects})
+    sensor = Sensor(position_resolution=2 * np.pi / 4096, position_noise=2e-4)
+    run = Setup(machine, Loop(kind="pd", kp=2.0, kd=0.05, reference=asked), sensor, RATE, seconds, seed).run()
+    return {"t": run["t"], "q": run["position"], "r": asked, "u": run["force"]}
+
+
+def searched(text: str, log: dict, kinds: tuple[str, ...] = (), **more) -> jaxid.Discovery:
+    """Discover, among some kinds only where they are given: fewer compile in less time."""
+    case = tomllib.loads(text)
+    if kinds:
+        case["discover"] = {"kinds": list(kinds)}
+    return jaxid.discover(case, log, **more)
+
+
+def without(text: str, *lines: str) -> str:
+    for line in lines:
+        assert line in text
+        text = text.replace(line, "")
+    return text.replace("period = 0.001", "period = 0.002")
+
+
+def test_a_missing_delay_is_named_and_put_into_the_controller(tmp_path):
+    """Among rivals that act on command and error; the corrected case has it where a case states it."""
+    text = without(CASE, "delay = { guess = 0.005 }\n", COULOMB)
+    rivals = ("command_delay", "command_lag", "dead_band", "viscous_friction")
+    given = short({"command_delay": {"delay": 0.03}})
+    d = searched(text, given, rivals)
+    assert (d.verdict, d.kinds) == ("found", ["command_delay"])
+    delay = d.parameters["command_delay.delay"]
+    assert abs(delay.value - 0.03) < 4 * delay.std
+    assert delay.std < 1e-3
+    assert d.model_complete is True
+
+    d.save(tmp_path / "out")
+    content = json.loads((tmp_path / "out" / "discovery.json").read_text())
+    assert content["gap"]["before"] is None
+    assert content["gap"]["band_hz"] is None
+    motion = content["gap"]["simulation"]
+    assert motion["after"] < 1.2 * motion["noise_floor"] < motion["before"]
+    first, last = content["steps"][0], content["steps"][-1]
+    assert first["fit"] is None
+    assert last["simulation"]["fit"] < first["simulation"]["fit"]
+    corrected = tomllib.loads((tmp_path / "out" / "case.toml").read_text())
+    assert corrected["controller"]["delay"]["guess"] == pytest.approx(delay.value)
+    assert [e["kind"] for e in corrected["effects"]] == ["viscous_friction"]
+    case = d.case()
+    assert case.controller.unknown["delay"].guess == pytest.approx(delay.value)
+    assert not any(e.cls.kind == "command_delay" for e in case.effects)
+
+
+def test_two_logs_are_refused():
+    with pytest.raises(InputError, match="discover without a force takes one log, not 2"):
+        jaxid.discover(tomllib.loads(CASE), [log(), log(seed=1)])
+
+
+def test_an_effect_on_the_command_has_no_place_in_a_search_with_a_force():
+    given = short({})
+    case = tomllib.loads(without(CASE, "delay = { guess = 0.005 }\n") + 'force = "u"\n')
+    case["controller"]["kd"] = 0.05
+    case["discover"] = {"candidates": ["command_lag"]}
+    with pytest.raises(InputError, match="command_lag .* a force"):
+        jaxid.discover(case, given)
+
+
+@pytest.mark.slow
+def test_a_complete_model_gets_nothing():
+    d = searched(CASE, log())
+    assert (d.verdict, d.kinds, d.model_complete) == ("nothing_missing", [], True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [CASE, FREE], ids=["known gain", "no scale"])
+def test_missing_dry_friction_is_named(text):
+    """Without a scale its ratio to the inertia is given, and nothing false is added."""
+    d = searched(text.replace(COULOMB, ""), log())
+    assert d.kinds == ["coulomb_friction"]
+    name, true = "coulomb_friction.level", TRUE["coulomb_friction.level"]
+    if text == CASE:
+        found = d.parameters[name]
+        assert abs(found.value - true) < 4 * found.std
+    else:
+        assert not d.parameters[name].identifiable
+        ratio = d.after.details["relative"]["values"][name]
+        assert abs(ratio["value"] - true / TRUE["inertia"]) < 4 * ratio["std"]
+
+
+HIDDEN = {
+    "command_lag": {"time_constant": 0.03},
+    "dead_band": {"width": 0.02},
+    "load_friction": {"coefficient": 0.25},
+    "stribeck_friction": {"level": 0.02, "velocity": 0.3},
+    "unbalance": {"moment": 4e-3, "phase": 0.6},
+    "saturation": {"limit": 0.12},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", HIDDEN)
+def test_a_hidden_effect_is_named_with_its_values(kind):
+    d = searched(CASE, log(**{kind: HIDDEN[kind]}))
+    assert len(d.kinds) == 1
+    assert kind in {d.kinds[0], *(s.candidate.kind for s in d.effects[0].alternatives)}
+    if d.kinds[0] == kind:
+        for name, true in HIDDEN[kind].items():
+            found = d.parameters[f"{kind}.{name}"]
+            assert abs(found.value - true) < 4 * found.std, name
+
+
+@pytest.mark.slow
+def test_another_log_confirms_or_refuses():
+    """The validation log of a machine without the effect does not confirm it."""
+    text = CASE.replace(COULOMB, "")
+    confirmed = searched(text, log(), validate=[log(seed=3)])
+    assert confirmed.kinds == ["coulomb_friction"]
+    assert confirmed.rounds[-1].position_validation[0] < 6e-4
+    assert DELAY == pytest.approx(confirmed.parameters["controller.delay"].value, abs=1e-3)
