@@ -119,7 +119,11 @@ def _searched(session: Session) -> tuple[Any, ...]:
         return searched
     # It was not measured at which position the machine is.
     scales = scales_of(session.machine.plant, session.fit.data)[0]
-    return tuple(cls for cls in searched if not acts_by_position(cls(**dict(cls.starts(scales)[0]))))
+    return tuple(
+        cls
+        for cls in searched
+        if not acts_by_position(cls(**dict(cls.starts(scales)[0])))  # pyright: ignore[reportArgumentType]  # values by name
+    )
 
 
 def _comparable(session: Session, base: np.ndarray) -> tuple[int, ...]:

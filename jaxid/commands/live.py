@@ -60,14 +60,15 @@ class Live:
     def __init__(self, case: CaseLike, *, identify: bool = False, tolerance: float = 0.05):
         case = load_case(case)
         scene = Scene.of(case)
-        if scene.machine.controller is None:
+        law = scene.machine.law
+        if law is None:
             raise InputError("there is no loop", where=case.where, hint="add a [controller]")
         self.machine = build_machine(case, period=scene.drive.period)
         self.reference: Float[np.ndarray, "ticks m"] = scene.signal
         self.period: float = scene.drive.period
         self.online_estimate: OnlineEstimate | None = None
         self.switched: int | None = None
-        self._controller = scene.machine.law
+        self._controller = law
         path = self._controller.path(jnp.asarray(self.reference))
         self._path = jax.tree.map(np.asarray, path)
         self._driven = self.machine.plant.driven(case.plant.joints)

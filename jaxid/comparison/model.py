@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +14,8 @@ from jaxid.discovery.candidates import Candidate
 Partition = tuple[tuple[int, ...], ...]
 
 
-class Unknown(NamedTuple):
+@dataclass(frozen=True)
+class Unknown:
     """An unknown number of a model.
 
     Args:
@@ -133,14 +133,14 @@ class Model:
         """
         theta = self.theta.copy()
         if change.effect is not None:
-            theta[np.ix_(change.logs, change.effect.index)] = start
+            theta[np.ix_(np.array(change.logs), change.effect.index)] = start
         return replace(self, theta=theta, changes=(*self.changes, change))
 
     def without(self, change: Change) -> Model:
         """Return the model without one of its changes, the others as they are."""
         theta = self.theta.copy()
         if change.effect is not None:
-            theta[np.ix_(change.logs, change.effect.index)] = change.effect.neutral
+            theta[np.ix_(np.array(change.logs), change.effect.index)] = change.effect.neutral
         out = replace(self, theta=theta, changes=tuple(c for c in self.changes if c is not change))
         if change.index is not None:
             for logs in out.partition(change.index):

@@ -145,9 +145,10 @@ class Whitened:
         self, columns: Sequence[Float[np.ndarray, "row u"]], e: Sequence[Float[np.ndarray, "row r"]]
     ) -> Float[np.ndarray, " r"]:
         """Return the held-out sums of squares of residuals after a fit of columns."""
-        gram = sum(ev.grams(c, b) for c, b in zip(columns, self.blocks, strict=True))
+        grams = [ev.grams(c, b) for c, b in zip(columns, self.blocks, strict=True)]
         pairs = [ev.products(c, x, b) for c, x, b in zip(columns, e, self.blocks, strict=True)]
-        return ev.held_out(np.asarray(gram), sum(p[0] for p in pairs), sum(p[1] for p in pairs))
+        mixed, squares = (np.sum([p[i] for p in pairs], axis=0) for i in (0, 1))
+        return ev.held_out(np.sum(grams, axis=0), mixed, squares)
 
     def left_out(
         self, columns: Sequence[Float[np.ndarray, "row u"]], e: Sequence[Float[np.ndarray, "row 1"]]

@@ -548,9 +548,9 @@ def _within(log: ComparedLog, other: ComparedLog) -> np.ndarray:
 
     def motion(one: ComparedLog) -> tuple[np.ndarray, np.ndarray]:
         parts = one.samples.parts
-        return tuple(
-            np.concatenate([p.at_kept(x(p)) for p in parts]) for x in (lambda p: p.q, lambda p: p.qd)
-        )
+        position = np.concatenate([p.at_kept(p.q) for p in parts])
+        velocity = np.concatenate([p.at_kept(p.qd) for p in parts])
+        return position, velocity
 
     inside = np.ones(log.counts.shape, bool)
     for own, others in zip(motion(log), motion(other), strict=True):

@@ -199,7 +199,9 @@ def with_effects(controller: Controller, plant: Plant, drives: int) -> Controlle
         if e.controller_field is None or drive is None:
             continue
         stated = getattr(controller, e.controller_field)
-        known = [0.0] * drives if stated is None else list(jnp.broadcast_to(jnp.asarray(stated), (drives,)))
+        known: list[Array | float] = [0.0] * drives
+        if stated is not None:
+            known = list(jnp.broadcast_to(jnp.asarray(stated), (drives,)))
         (value,) = (getattr(e, name) for name in parameters_of(type(e)))
         by_field.setdefault(e.controller_field, known)[drive] = value
     fields = {name: jnp.stack([jnp.asarray(v, float) for v in values]) for name, values in by_field.items()}

@@ -311,7 +311,7 @@ def _inline(value: Value | tuple[Value | float, ...]) -> Any:
 
     if isinstance(value, tuple):
         listed = tomlkit.array()
-        listed.extend([v if isinstance(v, float) else _inline(v) for v in value])
+        listed.extend([v if isinstance(v, (int, float)) else _inline(v) for v in value])
         return listed
     table = tomlkit.inline_table()
     table.append("guess", value.guess)

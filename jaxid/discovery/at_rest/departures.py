@@ -211,12 +211,13 @@ def _applied_command(machine: Machine, log: Log) -> np.ndarray:
     A single noisy sample above the level at a start would set the simulation in motion. The logged command is
     returned if there is no controller, or one that does not reproduce it.
     """
-    if machine.controller is None or log.reference is None:
+    law = machine.law
+    if law is None or log.reference is None:
         return log.force
     extra = disturbance_at(machine.disturbance, log.time, log)
     arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
     driven = machine.plant.driven(log.position.shape[1])
-    made = np.asarray(commands(machine.law, driven, *arrays))
+    made = np.asarray(commands(law, driven, *arrays))
     size = np.sqrt(np.mean(log.force**2, axis=0))
     stated = machine.sensor.force_noise
     noise = 0.0 if stated is None else np.asarray(stated)

@@ -172,11 +172,11 @@ def within_prior_steps(
         logs = rows_of(fit)
         notes += disagreement(logs, fit.count)
         entries = []
-        for log, rows in zip(logs, fit.problem.slices, strict=True):
-            entry: dict[str, Any] = {"samples": int(log.counts.sum())}
+        for fitted, rows in zip(logs, fit.problem.slices, strict=True):
+            entry: dict[str, Any] = {"samples": int(fitted.counts.sum())}
             weights = fit.problem.weight[rows][0]
             if np.sum(weights > 0) == 1:
-                entry["noise"] = float(log.equivalent_variance() ** 0.5 / weights.max())
+                entry["noise"] = float(fitted.equivalent_variance() ** 0.5 / weights.max())
             entries.append(entry)
         details |= by_log(parts, entries)
     notes = (*notes_of(parts[0].machine, numerics, parts[0].log, on, minimiser), *notes)

@@ -269,8 +269,9 @@ def _view(run: OpenedLog, before: Gap | None, after: Gap, joint: int, joints: in
 def search_step(r: Round) -> SearchStep:
     """Return one step of a search as it is drawn."""
     step = r.step
-    of_position = r.position_fit is not None
-    fit, validation = (r.position_fit, r.position_validation) if of_position else (r.fit, r.validation)
+    fit, validation = (
+        (r.fit, r.validation) if r.position_fit is None else (r.position_fit, r.position_validation)
+    )
     added = step.added.candidate if step.added else None
     return SearchStep(
         added=added.label if added else None,
