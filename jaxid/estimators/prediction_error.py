@@ -285,8 +285,10 @@ def _estimate(fit: JointLikelihood, end: Maximum, theta: np.ndarray, reads: Sequ
     """
     machine, several = fit.machine, len(fit.members) > 1
     rows = _rows(fit, end, theta)
-    plain = _precision(fit, rows, theta)
     jacobian, z, counts = stacked(rows)
+    finite = bool(np.all(np.isfinite(z[counts])) and np.all(np.isfinite(jacobian[counts])))
+    plain = _precision(fit, rows, theta) if finite else Precision.unknown(machine.parameters.names)
+    widened = widening(plain, jacobian, z, counts, [len(row.residual) for row in rows]) if finite else 1.0
 
     entries: list[dict[str, Any]] = []
     for member, row, noise, read in zip(fit.members, rows, end.noises, reads, strict=True):
@@ -316,16 +318,16 @@ def _estimate(fit: JointLikelihood, end: Maximum, theta: np.ndarray, reads: Sequ
         samples = [{"samples": int(row.counts.sum())} for row in rows]
         parts = [m.part for m in fit.members]
         details = by_log(parts, [s | entry for s, entry in zip(samples, entries, strict=True)])
-    converged = end.converged and bool(np.all(np.isfinite(theta)))
+    converged = end.converged and finite and bool(np.all(np.isfinite(theta)))
     return Estimate(
         method="prediction_error",
         machine=machine.with_estimate(theta),
         theta=theta,
-        precision=plain.widened(widening(plain, jacobian, z, counts, [len(row.residual) for row in rows])),
+        precision=plain.widened(np.broadcast_to(widened, len(theta))),
         converged=converged,
         message="converged" if converged else f"no convergence within {end.steps} steps",
         residual=np.where(counts, z, np.nan),
-        std_misspecified=std_under_misspecification(jacobian, z, counts),
+        std_misspecified=std_under_misspecification(jacobian, z, counts) if finite else None,
         samples=int(counts.sum()),
         steps=end.steps,
         notes=tuple(notes),

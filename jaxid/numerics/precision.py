@@ -227,6 +227,12 @@ class Precision:
     curvature: Float[np.ndarray, " 2"] | None = None
     equivalent_variance: Float[np.ndarray, " p"] | None = None
 
+    @classmethod
+    def unknown(cls, names: list[str]) -> Precision:
+        """Return the precision of a fit of which nothing is identifiable."""
+        p = len(names)
+        return cls(np.full((p, p), np.nan), np.zeros(p, bool), [{n: 1.0} for n in names], np.zeros(p))
+
     @property
     def std(self) -> Float[np.ndarray, " p"]:
         """Standard deviations, (p,); NaN for parameters that are not identifiable."""
@@ -339,12 +345,17 @@ def assess_from_sums(
         signal, scale, hessian, solved: See `assess`.
     """
     norm = np.sqrt(np.diag(gram))
-    dead = norm * np.abs(scale) <= 1e-9 * signal
+    # A column that is not finite says nothing, and would make all others not finite too.
+    dead = ~np.isfinite(norm) | (norm * np.abs(scale) <= 1e-9 * signal)
     norm = np.where(dead, 1.0, norm)
     normal = (gram if solved is None else solved) / np.outer(norm, norm)
     normal[dead] = 0.0
     normal[:, dead] = 0.0
     meat = meat / np.outer(norm, norm)
+    meat[dead] = 0.0
+    meat[:, dead] = 0.0
+    if np.all(dead) or not np.all(np.isfinite(normal)) or not np.all(np.isfinite(meat)):
+        return Precision.unknown(names)
     return _precision(names, normal, meat, norm, signal, hessian)
 
 

@@ -5,9 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from jaxid.build import build_machine
+from jaxid.case.case import load_case
 from jaxid.estimators.common.scoring import maximise_likelihood
-from jaxid.estimators.common.shapes import without_unseen_shapes
+from jaxid.estimators.common.shapes import within_a_turn, without_unseen_shapes
+from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
+from jaxid.numerics.precision import Precision
 from jaxid.session import open_session
 from truth.axis.cases import case_text, recorded
 from truth.axis.machines import Setup, emps_like, multisine
@@ -79,3 +83,27 @@ def test_scoring_stays_where_the_likelihood_has_slopes():
     fit = maximise_likelihood(outputs, np.ones((50, 1), bool), np.array([0.5]), *limits, 40)
     assert np.isfinite(fit.mean).all()
     assert 1.5 < float(fit.x[0]) <= 2.0
+
+
+def test_whole_turns_are_taken_off_a_phase():
+    """A step of a fit went 1e8 turns off, and 7e8 +- 0.03 rad was printed."""
+    case = {
+        "plant": {"kind": "axis", "parameters": {"inertia": {"guess": 2.0}}},
+        "effects": [{"kind": "cogging", "amplitude": 1.0, "period": 0.1, "phase": {"guess": 0.5}}],
+    }
+    machine = build_machine(load_case(case))
+    estimate = Estimate(
+        method="inverse_dynamics",
+        machine=machine,
+        theta=np.array([7.0, 0.7 + 2 * np.pi * 1e6]),
+        precision=Precision(np.eye(2), np.ones(2, bool), [], np.ones(2)),
+        converged=True,
+        message="converged",
+        residual=np.zeros((5, 1)),
+        samples=5,
+    )
+    found = within_a_turn(estimate)
+    # Of 1e6 turns some rounding stays.
+    np.testing.assert_allclose(found.theta, [7.0, 0.7], atol=1e-8)
+    assert float(found.machine.plant.effects[0].phase) == found.theta[1]
+    assert within_a_turn(found) is found

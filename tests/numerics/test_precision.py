@@ -280,3 +280,15 @@ def test_the_sandwich_of_white_noise_needs_no_transform():
     x = regressor()
     white, nearly = NoiseModel(np.zeros(0), 0.5), NoiseModel(np.zeros(1), 0.5)
     np.testing.assert_allclose(sandwich(x, white), sandwich(x, nearly), rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("column", [[1], [0, 1, 2, 3]], ids=["one column", "all columns"])
+def test_a_column_that_is_not_finite_is_not_identifiable(column):
+    """A likelihood without slopes ended in an eigenvalue solver that did not converge."""
+    x = regressor()
+    x[7, column] = np.nan
+    e = 0.1 * np.random.default_rng(3).standard_normal(len(x))
+    got = precision_of(x, e, signal=10.0)
+    assert not np.any(got.identifiable[column])
+    assert np.all(np.isfinite(got.std) == got.identifiable)
+    assert got.identifiable.sum() == 4 - len(column)
