@@ -97,6 +97,8 @@ def test_one_effect_with_formula_curve_and_snippet(tmp_path, capsys):
             "flexible_axis": ["motor_inertia", "load_inertia", "stiffness", "damping"],
         }
         values = {name: 1.0 for name in inertias[plant]}
+        if EFFECTS[kind].controller_field is not None:
+            given |= {"controller": {"kind": "pd", "kp": 1.0, "kd": 1.0}}
         jaxid.load_case({"plant": {"kind": plant, "motion": motion, "parameters": values}, **given})
     shown = run(capsys, "effects", "cogging").out
     assert "−amplitude · cos(2π · q / period + phase)" in shown

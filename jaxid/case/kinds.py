@@ -36,6 +36,11 @@ _OF_EFFECTS = (
     "controller_field",
     "any_direction",
     "alternatives",
+    "title",
+    "formula",
+    "met",
+    "part",
+    "shown_at",
 )
 _OF_LAWS = ("of_machine", "sees_error")
 # Numbers of places of a plant, which grow with its joints.

@@ -29,6 +29,11 @@ class ActuatorGain(Effect):
         has k_T^ k_T in place of k_T^; (23) holds at any H, not in the limit only.
     """
 
+    title = "a drive whose force differs from the declared one by a factor"
+    formula = "force of the drive = gain · u"
+    met = "a torque constant from a data sheet, warm magnets, losses of a gear"
+    part = "drive"
+
     adds_force = False
     in_drive = True
 
@@ -60,6 +65,12 @@ class ActuatorOffset(Effect):
         "PA-10 traineeship", section 5.2: an amplifier adds an offset to the command that it receives.
     """
 
+    title = "an offset of the drive"
+    formula = "force of the drive = u + level"
+    shown_at = {"level": 0.3}
+    met = "amplifiers with an uncalibrated zero, and current sensors that drift"
+    part = "drive"
+
     adds_force = False
     in_drive = True
     on_request = True
@@ -81,6 +92,11 @@ class ActuatorOffset(Effect):
 @register("actuator_lag")
 class ActuatorLag(Effect):
     """First-order lag between declared and applied force: T df/dt = u - f."""
+
+    title = "a drive that follows its command with a lag"
+    formula = "time_constant · df/dt = u − f, f being the force of the drive"
+    met = "slow current loops, pneumatic and hydraulic valves, filtered commands"
+    part = "drive"
 
     without_force = True
 
@@ -108,6 +124,11 @@ class ActuatorLag(Effect):
 class InputDelay(Effect):
     """The declared force acts later."""
 
+    title = "a command that acts late"
+    formula = "force of the drive at time t = u(t − delay)"
+    met = "field buses, computing time of a controller, and clocks of loggers that differ"
+    part = "drive"
+
     adds_force = False
     in_drive = True
 
@@ -131,6 +152,11 @@ class InputDelay(Effect):
 @register("saturation")
 class Saturation(Effect):
     """The force at the load is clipped to plus or minus limit."""
+
+    title = "a drive at its limit"
+    formula = "force of the drive = u, held between −limit and +limit"
+    met = "current limits and peak torque of motors"
+    part = "drive"
 
     without_force = True
     duplicates_field = "limit"
@@ -172,6 +198,12 @@ class VoltageLimit(Effect):
     Source:
         "PA-10 traineeship", (5.4)-(5.5), without the inductance, as there.
     """
+
+    title = "a supply whose voltage runs out"
+    formula = "|force of the drive| ≤ stall · (1 − v / velocity)"
+    shown_at = {"stall": 1.0, "velocity": 1.0}
+    met = "small servos and battery drives at high speed"
+    part = "drive"
 
     adds_force = False
     in_drive = True

@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from jaxid.arrays import Array
 from jaxid.effects.registry import register
 from jaxid.model.effect import Action, Effect, Scales, Signals
@@ -13,6 +15,9 @@ from jaxid.model.parameter import parameter
 
 # Longest delay and lag from which a search starts [s].
 _LONGEST = 0.2
+# Axes and times of the curves of delay and lag.
+_AFTER_A_STEP = ("time [s] after a step of the command", "reference of the controller")
+_TIME = np.linspace(-0.2, 1.0, 241)
 
 
 class _OnCommand(Effect):
@@ -31,10 +36,18 @@ class _OnCommand(Effect):
 class CommandDelay(_OnCommand):
     """The reference reaches the controller later; between two ticks it is interpolated."""
 
+    title = "a command that reaches the controller late"
+    formula = "reference of the controller at time t = reference(t − delay)"
+    met = "field buses and networks between a planner and a servo"
+    part = "controller"
+
     controller_field = "delay"
     of_reference = True
 
     delay: Array = parameter("time", "nonnegative", "delay of the reference")
+
+    def curve(self) -> tuple[str, str, np.ndarray, np.ndarray]:
+        return *_AFTER_A_STEP, _TIME, (_TIME >= float(self.delay)).astype(float)
 
     @classmethod
     def neutral(cls, scales: Scales) -> dict[str, float]:
@@ -53,10 +66,19 @@ class CommandLag(_OnCommand):
     Euler): the mean delay is T exactly, and without T the reference passes.
     """
 
+    title = "a command that is smoothed"
+    formula = "time_constant · dr/dt = reference − r, r being the command of the controller"
+    met = "servos that filter their command"
+    part = "controller"
+
     controller_field = "lag"
     of_reference = True
 
     time_constant: Array = parameter("time", "nonnegative", "T")
+
+    def curve(self) -> tuple[str, str, np.ndarray, np.ndarray]:
+        late = np.maximum(_TIME, 0.0) / max(float(self.time_constant), 1e-9)
+        return *_AFTER_A_STEP, _TIME, 1.0 - np.exp(-late)
 
     @classmethod
     def neutral(cls, scales: Scales) -> dict[str, float]:
@@ -74,9 +96,19 @@ class DeadBand(_OnCommand):
     Integrals add no error below it either; a gain on the velocity acts as ever.
     """
 
+    title = "a dead band of the controller"
+    formula = "error of the controller = 0 while |error| < width"
+    met = "hobby servos and drives that avoid hunting at rest"
+    part = "controller"
+
     controller_field = "dead_band"
 
     width: Array = parameter("position", "nonnegative", "one-sided; a larger error is not reduced")
+
+    def curve(self) -> tuple[str, str, np.ndarray, np.ndarray]:
+        error = np.linspace(-2.0, 2.0, 401) * float(self.width)
+        taken = np.where(np.abs(error) < float(self.width), 0.0, error)
+        return "position error", "error of the controller", error, taken
 
     @classmethod
     def neutral(cls, scales: Scales) -> dict[str, float]:

@@ -23,6 +23,11 @@ class Backlash(Effect):
     the elongation of the relaxed spring.
     """
 
+    title = "backlash"
+    formula = "force of the spring = stiffness · (elongation, less a dead zone of gap)"
+    met = "gears, worn couplings, keys and splines"
+    part = "gear"
+
     of_spring = True
     with_springs = True
     opens_spring = True
@@ -56,6 +61,11 @@ class JointFlexibility(Effect):
     whole; the effect subtracts its part J and adds the pull of the spring. The state is e times the spring's
     frequency, and e': both have one size.
     """
+
+    title = "an elastic transmission"
+    formula = "stiffness · e + damping · ė = load_inertia · a of the part behind it, e being the elongation"
+    met = "belts, long screws, harmonic drives and couplings"
+    part = "gear"
 
     without_force = True
 

@@ -15,6 +15,11 @@ from jaxid.numerics import smooth
 class ViscousFriction(Effect):
     """-c v."""
 
+    title = "viscous friction"
+    formula = "−coefficient · v"
+    met = "lubricated guides, bearings and seals, and eddy currents"
+    part = "load"
+
     without_force = True
 
     any_direction = True
@@ -37,6 +42,11 @@ class BackEmfDamping(Effect):
         The equations of a permanent-magnet DC motor without inductance: c = k_t k_e / R.
     """
 
+    title = "damping by the back-EMF"
+    formula = "−coefficient · v"
+    met = "motors that are driven by a voltage"
+    part = "drive"
+
     on_request = True
 
     coefficient: Array = parameter("force*time/position", "nonnegative", "c, drag per velocity")
@@ -48,6 +58,11 @@ class BackEmfDamping(Effect):
 @register("coulomb_friction")
 class CoulombFriction(Effect):
     """-F sign v, set-valued at rest; F is `level`, or `friction_coefficient` times normal force."""
+
+    title = "dry friction"
+    formula = "−level · sign v"
+    met = "guides, bearings and seals under preload, brushes and brakes"
+    part = "load"
 
     without_force = True
 
@@ -74,6 +89,11 @@ class CoulombFriction(Effect):
 class StaticFriction(Effect):
     """Break-away force above the sliding friction, at rest only."""
 
+    title = "break-away friction"
+    formula = "up to level more than dry friction, at rest only"
+    met = "guides, bearings and seals after a rest"
+    part = "load"
+
     break_away_level = "level"
 
     level: Array = parameter("force", "nonnegative", "break-away force above Coulomb's")
@@ -85,6 +105,11 @@ class StaticFriction(Effect):
 @register("stribeck_friction")
 class StribeckFriction(Effect):
     """-F_s exp(-(v/v_s)^2) sign v: the part above Coulomb friction at low velocity."""
+
+    title = "Stribeck friction"
+    formula = "−level · exp(−(v / velocity)²) · sign v"
+    met = "oil- and grease-lubricated guides, bearings and seals at low speed, where the film is thin"
+    part = "load"
 
     without_force = True
 
@@ -115,6 +140,11 @@ class LoadFriction(Effect):
         models 3 and 5: friction in proportion to the load, the same or by direction of the power.
     """
 
+    title = "friction that grows with the load"
+    formula = "−coefficient · |u| · sign v"
+    met = "worm and high-ratio gears, such as those of small servos"
+    part = "gear"
+
     needs_drive = True
     on_request = True
     without_force = True
@@ -143,6 +173,11 @@ class LoadFriction(Effect):
 class AsymmetricViscous(Effect):
     """-c |v|: viscous friction that differs by direction."""
 
+    title = "viscous friction that differs by direction"
+    formula = "−coefficient · |v|"
+    met = "lip seals, valves and wipers, which act unlike in both directions"
+    part = "load"
+
     coefficient: Array = parameter("force*time/position", "free", "c, half the difference")
 
     def act(self, x: Signals, state: None) -> Action:
@@ -152,6 +187,11 @@ class AsymmetricViscous(Effect):
 @register("quadratic_drag")
 class QuadraticDrag(Effect):
     """-c v |v|."""
+
+    title = "quadratic drag"
+    formula = "−coefficient · v · |v|"
+    met = "motion through air, water or oil, and fans"
+    part = "load"
 
     without_force = True
 
@@ -165,6 +205,11 @@ class QuadraticDrag(Effect):
 class CubicFriction(Effect):
     """-c v^3."""
 
+    title = "friction that grows with the cube of the velocity"
+    formula = "−coefficient · v³"
+    met = "joints of robots at high speed, and lubricants whose film grows"
+    part = "load"
+
     coefficient: Array = parameter("force*time3/position3", "free", "c")
 
     def act(self, x: Signals, state: None) -> Action:
@@ -175,6 +220,11 @@ class CubicFriction(Effect):
 class QuarticFriction(Effect):
     """-c v^3 |v|."""
 
+    title = "friction that grows with the fourth power of the velocity"
+    formula = "−coefficient · v³ · |v|"
+    met = "joints of robots over a wide range of speed"
+    part = "load"
+
     coefficient: Array = parameter("force*time4/position4", "free", "c")
 
     def act(self, x: Signals, state: None) -> Action:
@@ -184,6 +234,11 @@ class QuarticFriction(Effect):
 @register("friction_drift")
 class FrictionDrift(Effect):
     """Every dry-friction level times (1 + rate t), t from the start of the log."""
+
+    title = "friction that changes with time"
+    formula = "dry friction · (1 + rate · t)"
+    met = "warming bearings and gears"
+    part = "load"
 
     adds_force = False
 

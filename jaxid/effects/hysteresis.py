@@ -22,6 +22,11 @@ class Hysteresis(Effect):
         Dahl (1968), "A solid friction model", with exponent one.
     """
 
+    title = "presliding friction"
+    formula = "a spring of stiffness at each reversal, which slips at level"
+    met = "rolling guides and preloaded bearings within some micrometres of a reversal"
+    part = "load"
+
     stiffness: Array = parameter("force/position", "positive", "k, at reversal")
     level: Array = parameter("force", "positive", "F, where it slips")
 
@@ -54,6 +59,11 @@ class VelocityHysteresis(Effect):
         stage using a velocity hysteresis model", (7), (9), (10). (10) lacks a minus sign: as printed the
         term drives the table when it moves backwards.
     """
+
+    title = "Stribeck friction with memory"
+    formula = "−level · exp(−(v / velocity)²) · sign v while the speed grows"
+    met = "lubricated contacts whose film lags behind the speed"
+    part = "load"
 
     of_stages = True
 

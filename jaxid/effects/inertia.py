@@ -12,6 +12,11 @@ from jaxid.model.parameter import parameter
 class AddedMass(Effect):
     """-m (a + g): extra inertia, and its weight if gravity acts along the joint."""
 
+    title = "an added mass"
+    formula = "−mass · (a + g)"
+    met = "tools, payloads, rotors behind a gear, forgotten parts"
+    part = "load"
+
     any_direction = True
 
     mass: Array = parameter("inertia", "free", "m")

@@ -15,6 +15,11 @@ from jaxid.model.parameter import parameter
 class ConstantForce(Effect):
     """F0: an offset of the drive, or Coulomb levels that differ by direction."""
 
+    title = "a constant force"
+    formula = "+level"
+    met = "weight balances, cable chains, an offset of the drive, friction that differs by direction"
+    part = "load"
+
     without_force = True
 
     level: Array = parameter("force", "free", "F0")
@@ -26,6 +31,11 @@ class ConstantForce(Effect):
 @register("linear_stiffness")
 class LinearStiffness(Effect):
     """-k q."""
+
+    title = "a spring"
+    formula = "−coefficient · q"
+    met = "flexures, hoses, cable chains, bellows"
+    part = "gear"
 
     without_force = True
 
@@ -41,6 +51,11 @@ class LinearStiffness(Effect):
 class QuadraticStiffness(Effect):
     """-k2 q^2."""
 
+    title = "a spring that is stiffer on one side"
+    formula = "−coefficient · q²"
+    met = "hoses and preloaded flexures"
+    part = "gear"
+
     of_spring = True
 
     coefficient: Array = parameter("force/position2", "free", "k2")
@@ -52,6 +67,11 @@ class QuadraticStiffness(Effect):
 @register("cubic_stiffness")
 class CubicStiffness(Effect):
     """-k3 q^3."""
+
+    title = "a spring that stiffens"
+    formula = "−coefficient · q³"
+    met = "flexures, belts and rubber at large elongation"
+    part = "gear"
 
     of_spring = True
 
@@ -71,6 +91,11 @@ class Unbalance(Effect):
     Source:
         The torque of a point mass on a lever, m g r cos of its angle above the horizontal.
     """
+
+    title = "an unbalanced mass"
+    formula = "−moment · g · cos(q + phase)"
+    met = "joints that turn with their centre of mass off the axis"
+    part = "load"
 
     without_force = True
 
@@ -94,6 +119,11 @@ class Unbalance(Effect):
 @register("cogging")
 class Cogging(Effect):
     """-A cos(2 pi q / period + phase): a force periodic in position."""
+
+    title = "a ripple over the position"
+    formula = "−amplitude · cos(2π · q / period + phase)"
+    met = "motors with iron cores (cogging), teeth of belts and gears, ball screws (once a turn or a ball)"
+    part = "drive"
 
     amplitude: Array = parameter("force", "positive", "A")
     period: Array = parameter("position", "positive", "pitch of the ripple")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import equinox as eqx
+import numpy as np
 
 from jaxid.arrays import Array
 from jaxid.model.parameter import ParameterInfo, need_one, parameters_of
@@ -118,6 +120,15 @@ class Effect(eqx.Module):
     """
 
     kind: ClassVar[str]
+    # Words of reports and lists: name in a sentence; formula in the names of the parameters, with q the
+    # position, v the velocity and u the force that the drive is asked for; machines in which the effect is
+    # met; part of the drive chain on which it acts: "controller", "drive", "gear" or "load".
+    title: ClassVar[str] = ""
+    formula: ClassVar[str] = ""
+    met: ClassVar[str] = ""
+    part: ClassVar[str] = ""
+    # Values of parameters in a curve, where the usual ones show little.
+    shown_at: ClassVar[Mapping[str, float]] = {}
     port: int = eqx.field(static=True, default=0, kw_only=True)
 
     # Optional parameters that replace each other: exactly one of them is given.
@@ -136,6 +147,10 @@ class Effect(eqx.Module):
 
         A number, or a vector whose rate has constant coefficients (a linear oscillator).
         """
+        return None
+
+    def curve(self) -> tuple[str, str, np.ndarray, np.ndarray] | None:
+        """Return names and values of the curve of an effect that adds no force; None: it has none."""
         return None
 
     def command_delay(self) -> Array | float:

@@ -35,8 +35,6 @@ _USUAL = {
     "gain": 0.8,
     "stiffness": 4.0,
 }
-# Values of an effect whose parameters have others.
-_BY_KIND = {"actuator_offset": {"level": 0.3}, "voltage_limit": {"stall": 1.0, "velocity": 1.0}}
 _POINTS = 201
 _STEP = "time [s] after a step of the command"
 
@@ -109,7 +107,7 @@ def usual_values(kind: str) -> dict[str, float]:
             if given_one or name not in _class_of(kind).alternatives:
                 continue
             given_one = True
-        values[name] = _BY_KIND.get(kind, {}).get(name, _USUAL.get(name, 1.0))
+        values[name] = _class_of(kind).shown_at.get(name, _USUAL.get(name, 1.0))
     return values
 
 
@@ -127,6 +125,9 @@ def curve_of(kind: str) -> Curve | None:
     cls = EFFECTS[kind]
     values: dict[str, Any] = {name: np.asarray(value) for name, value in usual_values(kind).items()}
     effect = cls(**values)
+    shown = effect.curve()
+    if shown is not None:
+        return Curve(*shown)
     if cls.delays_command():
         t = np.linspace(-0.2, 1.0, _POINTS)
         late = float(np.asarray(effect.command_delay()))
@@ -138,7 +139,7 @@ def curve_of(kind: str) -> Curve | None:
         return _along(effect, np.asarray(memory, float))
     across = np.linspace(-1.0, 1.0, _POINTS)
     # A drive is asked for more than it gives, so that the limits of its supply show.
-    asked = {"u": np.full(_POINTS, 2.0)} if cls.in_drive else {}
+    asked = {"u": np.full(_POINTS, 2.0)} if cls.in_drive or cls.needs_drive else {}
     tried = (
         ("velocity", {"yd": across, **asked}),
         ("elongation" if cls.opens_spring else "position", {"y": across}),
@@ -150,7 +151,8 @@ def curve_of(kind: str) -> Curve | None:
         force, what = _force(effect, **signals)
         if np.all(np.isfinite(force)) and np.ptp(force) > 1e-9:
             return Curve(name, what, next(iter(signals.values())), force)
-    return None
+    force, what = _force(effect, y=across)
+    return Curve("position", what, across, force) if np.all(np.isfinite(force)) and force.any() else None
 
 
 def plot_curve(kind: str, curve: Curve) -> Figure:

@@ -37,6 +37,7 @@ ROOMS = {
     "steady": "tables of steady speeds and forces: opened and fitted",
     "experiment_design": "experiments that identify the unknowns best",
     "discovery": "the search for missing effects",
+    "comparison": "the search for what differs between logs",
     "studies": "Monte-Carlo studies",
     "results": "results as JSON, text and report",
     "export": "results in the formats of other programs",
@@ -49,6 +50,7 @@ ROOMS = {
 AGAINST = {
     ("discovery", "results"): "a result prints and saves itself",
     ("studies", "commands"): "a study of `discover` runs it",
+    ("comparison", "results"): "a result prints and saves itself",
     ("studies", "results"): "a result prints and saves itself",
     ("results", "commands"): "types only",
     ("estimators", "steady"): "a steady table has a fit of its own",

@@ -121,12 +121,16 @@ def _scale_words(session: Session) -> list[str]:
 def _residuals(machine: Machine, run: OpenedLog, gap: Gap, *, fitted: bool) -> list[Residual]:
     """Compare what a model leaves of a log with the noise: of the force, or of the position of a loop.
 
-    The force of a log slower than its loop is known at the rows only.
+    The force of a log slower than its loop is known at the rows only, so that a complete model may leave more
+    than noise of it. The position that the loop then simulates decides.
     """
-    slow = run.log.reference is not None and machine.ticks_between_rows(run.log)
-    if machine.unforced(run.log) or slow:
-        return position_residuals(machine, run, gap.simulation, fitted=fitted)
-    return residuals_of(machine, run, gap.force, fitted=fitted)
+    of_position = lambda: position_residuals(machine, run, gap.simulation, fitted=fitted)
+    if machine.unforced(run.log):
+        return of_position()
+    of_force = residuals_of(machine, run, gap.force, fitted=fitted)
+    if run.log.reference is None or not machine.ticks_between_rows(run.log) or _complete(of_force):
+        return of_force
+    return of_position()
 
 
 def _complete(residuals: Sequence[Residual]) -> bool | None:
