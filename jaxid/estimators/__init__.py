@@ -454,7 +454,9 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
         from jaxid.estimators.common.shapes import seen_shapes
 
         # A prior says something about every shape; other methods know what the log shows.
-        steps = lambda *args, **kwargs: seen_shapes(METHODS[method](*args, **kwargs))
+        steps = lambda *args, **kwargs: seen_shapes(
+            METHODS[method](*args, **kwargs), session.machine.parameters.guess
+        )
     if not session.case.identification.physically_consistent:
         return steps(session, **options)
     from jaxid.estimators.common.consistency import need_bodies, with_links

@@ -92,18 +92,19 @@ def test_whole_turns_are_taken_off_a_phase():
         "effects": [{"kind": "cogging", "amplitude": 1.0, "period": 0.1, "phase": {"guess": 0.5}}],
     }
     machine = build_machine(load_case(case))
+    far = np.array([7.0, 0.7 + 2 * np.pi * 1e6])
     estimate = Estimate(
         method="inverse_dynamics",
-        machine=machine,
-        theta=np.array([7.0, 0.7 + 2 * np.pi * 1e6]),
+        machine=machine.with_estimate(far),
+        theta=far,
         precision=Precision(np.eye(2), np.ones(2, bool), [], np.ones(2)),
         converged=True,
         message="converged",
         residual=np.zeros((5, 1)),
         samples=5,
     )
-    found = within_a_turn(estimate)
+    found = within_a_turn(estimate, machine.parameters.guess)
     # Of 1e6 turns some rounding stays.
     np.testing.assert_allclose(found.theta, [7.0, 0.7], atol=1e-8)
     assert float(found.machine.plant.effects[0].phase) == found.theta[1]
-    assert within_a_turn(found) is found
+    assert within_a_turn(found, machine.parameters.guess) is found

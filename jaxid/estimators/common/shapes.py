@@ -96,22 +96,28 @@ def without_unseen_shapes(estimate: Estimate) -> Estimate:
     return replace(estimate, precision=precision, notes=(*estimate.notes, note))
 
 
-def seen_shapes(steps: Generator[Any, Any, Estimate]) -> Generator[Any, Any, Estimate]:
+def seen_shapes(
+    steps: Generator[Any, Any, Estimate], guess: Float[np.ndarray, " p"]
+) -> Generator[Any, Any, Estimate]:
     """Run the steps of a fit; apply `without_unseen_shapes` and `within_a_turn` to its estimate."""
-    return within_a_turn(without_unseen_shapes((yield from steps)))
+    return within_a_turn(without_unseen_shapes((yield from steps)), guess)
 
 
-def within_a_turn(estimate: Estimate) -> Estimate:
+def within_a_turn(estimate: Estimate, guess: Float[np.ndarray, " p"]) -> Estimate:
     """Take whole turns off the phases of an estimate, so that each is within half a turn of its guess.
 
     A ripple is the same after a turn of its phase. A step of a fit may go over many of them.
+
+    Args:
+        estimate: The estimate.
+        guess: Guesses of the case, (p,).
     """
     machine, theta = estimate.machine, estimate.theta.copy()
     for k, free in enumerate(machine.parameters.free):
         if free.effect is None or not np.isfinite(theta[k]):
             continue
         info = parameters_of(type(machine.plant.effects[free.effect]))[str(free.path[-1])]
-        turns = np.round((theta[k] - free.guess) / (2 * np.pi))
+        turns = np.round((theta[k] - guess[k]) / (2 * np.pi))
         moved = theta[k] - 2 * np.pi * turns
         if info.dimension == "angle" and free.lower <= moved <= free.upper:
             theta[k] = moved
