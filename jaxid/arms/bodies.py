@@ -32,6 +32,23 @@ def links_of(plant: LinkTree) -> Float[np.ndarray, "links 10"]:
     return np.stack([np.asarray(getattr(plant, name)) for name in TEN], axis=-1)
 
 
+def about_centre(
+    ten: Float[np.ndarray, " 10"],
+) -> tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
+    """Return mass [kg], centre of mass [m] and inertia about that centre [kg m^2] of a body with a mass.
+
+    Args:
+        ten: Its ten parameters, in the order of `jaxid.names.TEN`, about the origin of its frame.
+
+    Source:
+        Steiner's theorem.
+    """
+    mass, centre = float(ten[0]), ten[1:4] / ten[0]
+    xx, xy, xz, yy, yz, zz = ten[4:]
+    about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return mass, centre, about_origin - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+
+
 def are_bodies(ten: Float[np.ndarray, "links 10"]) -> bool:
     """Check that each link is one that a body can be, or without any mass and inertia."""
     least = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(ten))))

@@ -6,9 +6,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 import scipy.stats
 from jaxtyping import Float
 
@@ -18,9 +16,9 @@ from jaxid.comparison.screen import Scored, Screen, screen_changes
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.acceptance import RELEVANT, absorbed_noise
+from jaxid.discovery.bounded_fit import bounded_fit
 from jaxid.discovery.domain import ForceDomain
 from jaxid.discovery.selection import MODEST, TIE_NATS, TIE_PART
-from jaxid.estimators.common.levenberg_marquardt import Transform
 
 # Number of best changes that are refitted. Those below this part of the best one follow only if none of the
 # others may be made.
@@ -319,35 +317,8 @@ class Search:
         if not unknowns:
             return model
         some = cand.free_of(self.superset, np.array([u.index for u in unknowns]))
-        transform = Transform.of(some)
-        lower, upper = (np.asarray(transform.inward(b)) for b in some.bounds)
-        latest: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-
-        # The solver asks for residual and Jacobian at the same point one after the other.
-        def both(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            key = x.tobytes()
-            if key not in latest:
-                latest.clear()
-                values = np.asarray(transform.outward(jnp.asarray(x)))
-                e, columns = self._rows(model.at(values), whitened)
-                slope = np.asarray(transform.slope(jnp.asarray(values)))
-                with np.errstate(invalid="ignore", over="ignore"):  # diverged values are made finite below
-                    latest[key] = (_finite(e), _finite(columns * slope))
-            return latest[key]
-
-        start = np.clip(np.asarray(transform.inward(jnp.asarray(model.values()))), lower, upper)
-        found = scipy.optimize.least_squares(
-            lambda x: both(x)[0],
-            start,
-            lambda x: both(x)[1],  # pyright: ignore[reportArgumentType] (SciPy's stubs know names of methods only)
-            (lower, upper),
-            x_scale="jac",
-            ftol=1e-7,
-            xtol=1e-7,
-            gtol=1e-10,
-            max_nfev=_EVALUATIONS,
-        )
-        return model.at(np.asarray(transform.outward(jnp.asarray(found.x))))
+        rows = lambda values: self._rows(model.at(values), whitened)
+        return model.at(bounded_fit(some, model.values(), rows, most=_EVALUATIONS)[0])
 
     def residuals(self, model: Model) -> list[Float[np.ndarray, "kept n"]]:
         """Return the force residual of a model on each log."""
@@ -557,8 +528,3 @@ def _within(log: ComparedLog, other: ComparedLog) -> np.ndarray:
         low, high = others.min(axis=0), others.max(axis=0)
         inside &= (own >= low) & (own <= high)
     return inside
-
-
-def _finite(x: np.ndarray) -> np.ndarray:
-    """Replace diverged values by numbers so large that a solver turns back, yet small enough to square."""
-    return np.clip(np.nan_to_num(x, nan=1e60), -1e60, 1e60)

@@ -15,11 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
-from jaxid.estimators.common.levenberg_marquardt import Transform
+from jaxid.discovery.bounded_fit import bounded_fit
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
@@ -40,6 +39,8 @@ _PIECES = 4
 # Number of directions in which the superset is differentiated at once. It is small, so that the intermediate
 # arrays of a long log stay in the processor's cache.
 _COLUMNS = 4
+# Largest number of evaluations of a refit.
+_EVALUATIONS = 25
 # Latest points of the superset whose residual and columns are kept: a search asks for most of them again.
 _POINTS = 8
 # Strength at which the columns of an added force are computed, relative to the strength of its start.
@@ -364,45 +365,21 @@ def refine(
         return theta.copy(), True
     some = free_of(superset, moving)
     evaluated = at_point or (lambda data, at, wanted: evaluate(superset, data, at, wanted))
-    transform = Transform.of(some)
-    lower, upper = (np.asarray(transform.inward(b)) for b in some.bounds)
     weight = data.weight[..., None]
-    latest: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
-    # The solver asks for residual and Jacobian at the same point one after the other.
-    def both(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        key = x.tobytes()
-        if key not in latest:
-            latest.clear()
-            at = theta.copy()
-            at[moving] = np.asarray(transform.outward(jnp.asarray(x)))
-            e, jacobian = evaluated(data, at, moving)
-            slope = np.asarray(transform.slope(jnp.asarray(at[moving])))
-            with np.errstate(invalid="ignore", over="ignore"):  # diverged values are made finite below
-                rows = (jacobian[..., moving] * slope * weight).reshape(-1, len(moving))
-            latest[key] = (_finite(e * weight[..., 0]).ravel(), _finite(rows))
-        return latest[key]
+    def at(values: np.ndarray) -> np.ndarray:
+        out = theta.copy()
+        out[moving] = values
+        return out
 
-    start = np.clip(np.asarray(transform.inward(jnp.asarray(theta[moving]))), lower, upper)
-    fit = scipy.optimize.least_squares(
-        lambda x: both(x)[0],
-        start,
-        lambda x: both(x)[1],  # pyright: ignore[reportArgumentType] (SciPy's stubs know names of methods only)
-        (lower, upper),
-        x_scale="jac",
-        ftol=1e-7,
-        xtol=1e-7,
-        gtol=1e-10,
-        max_nfev=25,
-    )
-    out = theta.copy()
-    out[moving] = np.asarray(transform.outward(jnp.asarray(fit.x)))
-    return out, bool(fit.status > 0)
+    def rows(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        e, jacobian = evaluated(data, at(values), moving)
+        with np.errstate(invalid="ignore", over="ignore"):  # diverged values are made finite by the fit
+            columns = (jacobian[..., moving] * weight).reshape(-1, len(moving))
+            return (e * weight[..., 0]).ravel(), columns
 
-
-def _finite(x: np.ndarray) -> np.ndarray:
-    """Replace diverged values by numbers so large that a solver turns back, yet small enough to square."""
-    return np.clip(np.nan_to_num(x, nan=1e60), -1e60, 1e60)
+    values, converged = bounded_fit(some, theta[moving], rows, most=_EVALUATIONS)
+    return at(values), converged
 
 
 def points(

@@ -74,6 +74,30 @@ class Where:
     high: Float[np.ndarray, " bin"]
     frequency_hz: float | None = None
 
+    @classmethod
+    def in_time(cls, joint: int, region: tuple[float, float], text: str, explained: float) -> Where:
+        """Return a stretch of time as the place of a residual that no curve over a variable describes.
+
+        Args:
+            joint, region, text, explained: See `Where`.
+        """
+        none = np.zeros(0)
+        return cls(
+            joint=joint,
+            variable="time",
+            region=region,
+            intervals=(region,),
+            text=text,
+            explained=explained,
+            evidence=0.0,
+            threshold=0.0,
+            clear=True,
+            x=none,
+            mean=none,
+            low=none,
+            high=none,
+        )
+
     @property
     def significant(self) -> bool:
         """True if the residual holds more than noise."""

@@ -11,7 +11,7 @@ from xml.parsers import expat
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.arms.bodies import Bodies, are_bodies, bodies_of
+from jaxid.arms.bodies import Bodies, about_centre, are_bodies, bodies_of
 from jaxid.case.mjcf import is_one_of, need_mujoco, robot_of_spec
 from jaxid.case.robot import Robot, RobotJoint, body_in, kept, moved_by, projected
 from jaxid.errors import InputError
@@ -296,14 +296,11 @@ class _Work:
             self.notes.append(f"joint '{joint.name}': {what}")
             self.real = False
             return
-        mass, centre = new[0], new[1:4] / new[0]
-        xx, xy, xz, yy, yz, zz = new[4:]
-        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        tensor = tensor - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+        mass, centre, tensor = about_centre(new)
         six = [tensor[i] for i in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
         values: dict[str, str | None] = {
             "pos": " ".join(repr(float(v)) for v in centre),
-            "mass": repr(float(mass)),
+            "mass": repr(mass),
             "fullinertia": " ".join(repr(float(v)) for v in six),
         }
         element = self.elements.bodies[body]

@@ -12,7 +12,7 @@ from xml.parsers import expat
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.arms.bodies import Bodies, are_bodies, bodies_of
+from jaxid.arms.bodies import Bodies, about_centre, are_bodies, bodies_of
 from jaxid.case.robot import Robot, RobotJoint, body_in, kept, projected, towards
 from jaxid.case.urdf import read_inertial, read_urdf_tree
 from jaxid.errors import InputError
@@ -139,14 +139,11 @@ class _Work:
             self.notes.append(f"joint '{joint.name}': {what}")
             self.real = False
             return
-        mass, centre = new[0], new[1:4] / new[0]
-        xx, xy, xz, yy, yz, zz = new[4:]
-        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        tensor = tensor - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+        mass, centre, tensor = about_centre(new)
         six = dict(zip(_TENSOR, tensor[np.triu_indices(3)].tolist(), strict=True))
         parts = {
             "origin": {"xyz": " ".join(repr(float(v)) for v in centre), "rpy": "0 0 0"},
-            "mass": {"value": repr(float(mass))},
+            "mass": {"value": repr(mass)},
             "inertia": {n: repr(v) for n, v in six.items()},
         }
         listed = {t: " ".join(f'{n}="{v}"' for n, v in values.items()) for t, values in parts.items()}

@@ -102,7 +102,9 @@ def _residual(chosen: Chosen) -> Figure | None:
     view = chosen.view
     if view.residual_after is None or not len(view.band_time):
         return None
-    return plots.plot_residual_over_time(view, chosen.units, noise_floor=_floor(chosen))
+    figure = Figure(figsize=(11.5, 2.9), layout="constrained")
+    plots.draw_residual(figure.add_subplot(), view, chosen.units, noise_floor=_floor(chosen))
+    return figure
 
 
 def _scatter(chosen: Chosen) -> Figure | None:

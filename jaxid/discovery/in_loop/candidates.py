@@ -362,22 +362,8 @@ class Loop:
         k = int(np.argmax(power))
         times = log.time[[k, k + _LAGS - 1]] - log.time[0]
         region = (float(times[0]), float(times[1]))
-        none = np.zeros(0)
-        return Where(
-            joint=1,
-            variable="time",
-            region=region,
-            intervals=(region,),
-            text=f"the loop's residual is largest between {region[0]:.3g} and {region[1]:.3g} s",
-            explained=float(power[k] / np.sum(e**2)),
-            evidence=0.0,
-            threshold=0.0,
-            clear=True,
-            x=none,
-            mean=none,
-            low=none,
-            high=none,
-        )
+        text = f"the loop's residual is largest between {region[0]:.3g} and {region[1]:.3g} s"
+        return Where.in_time(1, region, text, float(power[k] / np.sum(e**2)))
 
 
 def _follows(effect: type[Effect]) -> bool:

@@ -207,20 +207,7 @@ def _where(log: Log, gap: Gap) -> Where | None:
     power = np.convolve(squares[:, joint], np.ones(window), "valid")
     k = int(np.argmax(power))
     begin, end = (float(log.time[i] - log.time[0]) for i in (k, k + window - 1))
-    none = np.zeros(0)
     at = f"joint {joint + 1}: " if e.shape[1] > 1 else ""
-    return Where(
-        joint=joint + 1,
-        variable="time",
-        region=(begin, end),
-        intervals=((begin, end),),
-        text=f"{at}the simulated position is farthest from the log between {begin:.3g} and {end:.3g} s",
-        explained=float(power[k] / max(np.sum(squares[:, joint]), 1e-300)),
-        evidence=0.0,
-        threshold=0.0,
-        clear=True,
-        x=none,
-        mean=none,
-        low=none,
-        high=none,
-    )
+    text = f"{at}the simulated position is farthest from the log between {begin:.3g} and {end:.3g} s"
+    part = float(power[k] / max(np.sum(squares[:, joint]), 1e-300))
+    return Where.in_time(joint + 1, (begin, end), text, part)

@@ -143,34 +143,6 @@ def draw_difference(ax: Axes, view: LogView, units: Mapping[str, str]) -> None:
     legend(ax)
 
 
-def plot_residual_over_time(
-    view: LogView,
-    units: Mapping[str, str],
-    *,
-    noise_floor: float | None = None,
-    size: tuple[float, float] = (11.5, 4.8),
-) -> Figure:
-    """Draw measured force over time, and below it the force residual.
-
-    Args:
-        view: The log.
-        units: Labels of "force" and "time".
-        noise_floor: RMS that sensor noise alone leaves, drawn as a pair of lines; may be None.
-        size: Width and height [inch].
-
-    Returns:
-        The figure.
-    """
-    residuals = _residuals(view)
-    figure, top, below = time_axes(size, 2 if residuals else 1, ratios=(2, 3))
-    many = bucket_count(size)
-    draw_force(top, view, units, many=many)
-    if below is not None:
-        top.set_xlabel("")
-        draw_residual(below, view, units, noise_floor=noise_floor, many=many)
-    return figure
-
-
 def draw_force(ax: Axes, view: LogView, units: Mapping[str, str], *, many: int = _MANY) -> None:
     """Draw the measured force over time on one axes.
 
