@@ -30,8 +30,6 @@ def child(kind: str, *words: object) -> dict:
     """What a fresh process prints of itself, on a kind of device."""
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
     environment = os.environ | dict.fromkeys(names, "1") | {"JAX_PLATFORMS": kind}
-    # Without it jaxlib 0.11 waits for itself where threads run compiled code on a processor at once.
-    environment["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false"
     line = [sys.executable, "-m", "benchmarks.accelerator", "--child", *map(str, words)]
     done = subprocess.run(line, capture_output=True, text=True, env=environment, cwd=HERE.parent)
     if done.returncode:

@@ -3,10 +3,12 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
+from jaxid import _platform
 from tests.support.imports import imports
 from tests.support.rooms import AGAINST, ROOMS
 
@@ -73,6 +75,27 @@ def test_warns_where_the_backend_is_already_up():
     lines = fresh(code)
     assert lines[0] == "1 True"
     assert lines[1].endswith("None float64")
+
+
+@pytest.mark.parametrize(
+    ("installed", "flags", "expected"),
+    [
+        ("0.10.2", OWN, OWN),
+        ("0.12.0", OWN, OWN),
+        ("0.11.2", OWN, f"{OWN} --xla_cpu_multi_thread_eigen=false"),
+        ("0.11.2", "--xla_cpu_multi_thread_eigen=true", "--xla_cpu_multi_thread_eigen=true"),
+    ],
+)
+def test_threads_of_jaxlib_0_11_need_a_flag(monkeypatch, installed, flags, expected):
+    monkeypatch.setattr(_platform, "_installed_jaxlib", lambda: installed)
+    assert _platform._with_threads_flag(flags) == expected
+
+
+def test_the_installed_version_is_read_without_an_import():
+    code = (
+        "import sys; from jaxid import _platform as p; print(p._installed_jaxlib(), 'jaxlib' in sys.modules)"
+    )
+    assert fresh(code)[0] == f"{version('jaxlib')} False"
 
 
 LOOP = """
