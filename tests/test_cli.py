@@ -68,7 +68,7 @@ def test_alone_it_greets_with_three_examples(capsys):
 
 
 def test_every_help_ends_with_examples_of_its_command(capsys):
-    parsers = cli._parser()._subparsers._group_actions[0].choices
+    parsers = cli.build_parser()._subparsers._group_actions[0].choices
     assert {"report", "plot", "effects", *COMMANDS} <= set(parsers)
     for name, parser in parsers.items():
         shown = parser.format_help()
@@ -78,7 +78,7 @@ def test_every_help_ends_with_examples_of_its_command(capsys):
             # Each example is one that the command accepts.
             words = line.split(">")[0].split()
             assert words[:2] == ["jaxid", name]
-            assert cli._parser().parse_args(words[1:]).command == name
+            assert cli.build_parser().parse_args(words[1:]).command == name
     assert all(f"{m} " in parsers["identify"].format_help() for m in names.METHODS)
 
 

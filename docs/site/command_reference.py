@@ -19,7 +19,7 @@ only."""
 
 def page(folder: Path) -> str:
     """Return the page."""
-    subparsers = next(a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction))
+    subparsers = next(a for a in cli.build_parser()._actions if isinstance(a, argparse._SubParsersAction))
     parts = [_INTRODUCTION]
     for name, parser in subparsers.choices.items():
         usage = parser.format_usage().removeprefix("usage: ")

@@ -19,7 +19,7 @@ page is made from these schemas."""
 
 def schemas() -> dict[str, str]:
     """Return each schema of the command, as it prints it."""
-    subparsers = next(a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction))
+    subparsers = next(a for a in cli.build_parser()._actions if isinstance(a, argparse._SubParsersAction))
     names = next(a.choices for a in subparsers.choices["schema"]._actions if a.choices)
     out = {}
     for name in names:

@@ -128,7 +128,7 @@ def test_toml_and_json_parse(page):
 @pytest.fixture(scope="module")
 def commands() -> dict[str, set[str]]:
     """Subcommands of the command line, and the options of each."""
-    subparsers = next(a for a in cli._parser()._actions if a.choices)
+    subparsers = next(a for a in cli.build_parser()._actions if a.choices)
     return {word: {*sub._option_string_actions} for word, sub in subparsers.choices.items()}
 
 
@@ -140,7 +140,7 @@ def test_commands_are_those_of_the_command_line(page, commands):
                 for part in line.split(" && "):
                     if COMMAND.match(part.strip()):
                         words = shlex.split(part.strip().removeprefix("$ "), comments=True)
-                        cli._parser().parse_args(words[1:])
+                        cli.build_parser().parse_args(words[1:])
     # In prose a command may leave out its files.
     prose = re.sub(r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.M | re.S)
     for code in re.findall(r"`([^`]+)`", prose):

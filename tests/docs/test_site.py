@@ -72,7 +72,7 @@ def test_every_plant_command_and_public_name_is_in_the_reference(pages):
     for name in jaxid._HOMES:
         assert f"\n## `jaxid.{name}`\n" in text(pages, "reference/python.md")
     page = text(pages, "reference/commands.md")
-    subparsers = next(a for a in cli._parser()._actions if isinstance(a, argparse._SubParsersAction))
+    subparsers = next(a for a in cli.build_parser()._actions if isinstance(a, argparse._SubParsersAction))
     for name, parser in subparsers.choices.items():
         section = page.partition(f"\n## `jaxid {name}`\n")[2].partition("\n## ")[0]
         for action in parser._actions:

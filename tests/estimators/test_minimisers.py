@@ -11,6 +11,7 @@ import pytest
 
 import jaxid
 from jaxid import cli
+from jaxid.command_line import inputs, parser
 from jaxid.estimators.common.levenberg_marquardt import BoundedLevenbergMarquardt, Transform
 from jaxid.estimators.common.minimise import failure_text, minimise
 from jaxid.estimators.common.minimisers import MINIMISERS, minimiser_name, minimiser_of
@@ -167,7 +168,7 @@ def test_an_axis_is_fitted_alike_by_all(closed, name):
 
 
 def test_names_stand_once():
-    assert cli.MINIMISERS is MINIMISERS
+    assert parser.MINIMISERS is inputs.MINIMISERS is MINIMISERS
     for name in MINIMISERS[1:]:
         assert minimiser_name(minimiser_of(name)) == name
     assert minimiser_of(None) is None is minimiser_of("levenberg_marquardt")

@@ -43,7 +43,8 @@ ROOMS = {
     "export": "results in the formats of other programs",
     "commands": "the commands, one a file",
     "demo": "the demonstration and its log",
-    "cli": "the command line",
+    "command_line": "arguments of the commands, a command a file; calls of their functions",
+    "cli": "the table of commands, and the exit status",
 }
 
 # Imports that run against the order, each with its reason. None may be added without one.
