@@ -1,0 +1,111 @@
+"""A prepared log held against its case: sign, hold and noise of the force, and the control law."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jaxid.build import drives_of_case
+from jaxid.case.case import Case
+from jaxid.consistency.balance_fit import BalanceFit, balance_fits
+from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
+from jaxid.consistency.law import law_findings, loop_velocity_findings, replayed_law
+from jaxid.consistency.noise import estimated_force_noise, noise_findings
+from jaxid.consistency.reference_hold import (
+    compare_reference_holds,
+    reference_hold_finding,
+    reference_hold_setting,
+)
+from jaxid.consistency.sign import sign_findings
+from jaxid.consistency.weight import weight_findings
+from jaxid.logs.soundness import Finding, raise_on_error
+from jaxid.machine import Machine
+from jaxid.session.opened import OpenedLog
+from jaxid.session.preparing import under_hold
+
+
+@dataclass(frozen=True)
+class AgainstCase:
+    """Result of `hold_against_case`.
+
+    Args:
+        findings: Warnings.
+        hold: Hold of the force to take in place of the log's; None: the log's.
+        reference_hold: Course of the reference between samples.
+        force_noise: Estimated noise of the force, in units of the command, (m,).
+        settings: Choices made from the log; see `Session`.
+    """
+
+    findings: list[Finding]
+    hold: str | None
+    reference_hold: str
+    force_noise: np.ndarray
+    settings: dict[str, dict[str, str]]
+
+
+def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold: bool) -> AgainstCase:
+    """Hold a prepared log against its case.
+
+    Args:
+        case: The case, as it was logged.
+        machine: Its machine.
+        opened: The log.
+        free_hold: Whether the hold of the force is to be chosen, because the case does not state it.
+
+    Raises:
+        InputError: If the log contradicts the case.
+    """
+    log, data = opened.log, opened.data
+    if log.passive:
+        # Sign, hold and noise of a force, and a law, need a force.
+        return AgainstCase([], None, machine.reference_hold, np.zeros(log.force.shape[1]), {})
+    declared = balance_fits(machine, data)[0]
+    if not declared.finite:
+        return AgainstCase([], None, machine.reference_hold, np.zeros(log.force.shape[1]), {})
+    gain = None
+    if case.actuator.transmission is None and case.actuator.torque_constant is None:
+        gain = drives_of_case(case, machine.plant).gain.tolist()
+    findings = sign_findings(machine, log, data, declared, gain)
+    raise_on_error(findings)
+
+    hold, better, settings = None, better_hold(machine, log, data, declared), {}
+    if better is not None:
+        findings.append(hold_finding(log, *better, machine.unit("force"), used=free_hold))
+        if free_hold:
+            hold = better[0]
+            settings["hold"] = hold_setting(log.hold, *better, machine.unit("force"))
+            opened = under_hold(hold, opened, machine)
+            log, data = opened.log, opened.data
+            declared = balance_fits(machine, data)[0]
+
+    confirmed = False
+    if case.log is not None and case.log.reference is not None:
+        machine, doubts, setting, confirmed = _with_reference_hold(case, machine, opened, declared)
+        findings, settings = [*findings, *doubts], settings | setting
+    replayed = replayed_law(machine, log)
+    findings += law_findings(machine, log, replayed, confirmed=confirmed)
+    findings += loop_velocity_findings(machine, log)
+    raise_on_error(findings)
+
+    findings += weight_findings(machine, log, declared)
+    made = replayed.command if replayed is not None and replayed.exact else None
+    noise = estimated_force_noise(machine, log, data, declared, made)
+    findings += noise_findings(machine, log, data, declared, noise)
+    return AgainstCase(findings, hold, machine.reference_hold, noise, settings)
+
+
+def _with_reference_hold(
+    case: Case, machine: Machine, opened: OpenedLog, declared: BalanceFit
+) -> tuple[Machine, list[Finding], dict[str, dict[str, str]], bool]:
+    """Return the machine with its reference's course, warnings, settings, and if the law is confirmed."""
+    compared = compare_reference_holds(machine, opened.log, opened.data, declared)
+    if compared is None:
+        return machine, [], {}, False
+    stated, unit = case.columns.reference_hold is not None, machine.unit("force")
+    findings = reference_hold_finding(opened.log, compared, machine.reference_hold, unit, stated=stated)
+    if compared.best is not None and not stated:
+        machine = replace(machine, reference_hold=compared.best)
+    setting = reference_hold_setting(compared, machine.reference_hold, unit, stated=stated)
+    confirmed = machine.reference_hold in compared.confirmed
+    return machine, findings, {"reference_hold": setting}, confirmed

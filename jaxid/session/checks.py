@@ -1,0 +1,62 @@
+"""Checks of a log before it is prepared."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxid.case.case import Case
+from jaxid.consistency.absent import check_absent
+from jaxid.logs.log import Log
+from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
+from jaxid.machine import Machine
+
+
+def log_findings(case: Case, log: Log, machine: Machine, short: bool, *, alone: bool = True) -> list[Finding]:
+    """Check a log, and return the findings.
+
+    Args:
+        case: The case.
+        log: The log.
+        machine: The machine on this log.
+        short: Whether a fit within a prior needs two positions only.
+        alone: Whether no other log is fitted with it.
+
+    Raises:
+        InputError: If the log is unsound.
+    """
+    limit = None if case.controller is None else case.controller.limit
+    units, plant = machine.units, machine.plant
+    motions = [plant.motion(j) or units.motion for j in range(plant.joints)]
+    driven = np.asarray(plant.at_drives(np.arange(plant.joints)))
+    stated = machine.sensor.position_resolution is not None
+    findings = check_log(
+        log,
+        command_limit=limit,
+        motion=motions,
+        units={"position": units.position} if units.position else None,
+        driven=driven,
+        fewest_levels=2 if short else FEWEST_LEVELS,
+        resolution_stated=stated,
+        free=True,
+    )
+    check_absent(case, machine, log, alone=alone)
+
+    impossible = plant.impossible(log.position) if all(log.measured) else None
+    if impossible is not None:
+        row, what = impossible
+        hint = "check the lengths, the zeros of the angles and their unit (rad)"
+        findings.append(Finding("error", f"row {log.rows[0] + row}: {what}", f"{log.source}, position", hint))
+
+    inertia = plant.own_inertia()
+    if inertia is not None:
+        slip = plausible_inertia(log, np.asarray(inertia), machine.gain, motion=motions, driven=driven)
+        findings += [slip] if slip is not None else []
+
+    raise_on_error(findings)
+    return findings
+
+
+def parts_left_out(case: Case) -> list[Finding]:
+    """Return the parts of a robot's file that the machine does not hold."""
+    hint = "state an effect if the log shows it"
+    return [Finding("warning", note, f"{case.where}, [plant]", hint) for note in case.plant.notes]
