@@ -40,13 +40,13 @@ BOUNDS = (jnp.asarray([1e-9, 0.0, 0.0, -np.inf]), jnp.full(4, np.inf))
 
 
 def log(samples: int = 25_000) -> tuple[np.ndarray, np.ndarray]:
-    """Reference and measured position of the stepper's log."""
+    """Simulate the log by the exact stepper; return reference and measured position [m], each (time,)."""
     setup = machines.emps_like(duration=25.0).with_effect("constant_force", level=TRUTH[3])
     return setup.loop.reference[:samples], np.asarray(setup.run()["position"])[:samples]
 
 
 def plant(theta: np.ndarray, sharpness: float = 1e-3) -> Axis:
-    """The axis at some parameters."""
+    """Build the axis at some values of its four parameters; see `PLACES` for their order."""
     effects = (
         EFFECTS["viscous_friction"](coefficient=1.0),
         EFFECTS["coulomb_friction"](level=1.0),
@@ -56,7 +56,12 @@ def plant(theta: np.ndarray, sharpness: float = 1e-3) -> Axis:
 
 
 def replay(reference: np.ndarray, numerics: Numerics) -> Replay:
-    """The run in the loop, from rest, the reading exact."""
+    """Set up the simulated run in the loop: from rest, by exact readings of the position.
+
+    Args:
+        reference: Reference position [m], (time,).
+        numerics: Steps and friction.
+    """
     law = CascadePD(
         kp=jnp.asarray(160.18),
         kv=jnp.asarray(243.45),
@@ -82,17 +87,17 @@ def replay(reference: np.ndarray, numerics: Numerics) -> Replay:
 
 
 def simulated(run: Replay, base: Axis, theta: jax.Array) -> jax.Array:
-    """Position as a function of the parameters."""
+    """Simulate the position [m], (time,), at some values of the parameters, (4,)."""
     return run(scatter(PLACES, base, theta)).position[:, 0]
 
 
 def jacobian(run: Replay, base: Axis, theta: jax.Array) -> jax.Array:
-    """Forward-mode Jacobian of the position, (time, 4)."""
+    """Differentiate the position by the parameters in forward mode, (time, 4)."""
     return jax.jacfwd(lambda x: simulated(run, base, x))(theta)
 
 
 def gauss_newton(run: Replay, base: Axis, theta: jax.Array, measured: jax.Array) -> tuple:
-    """J'J, J'e and half the sum of squares."""
+    """Return J'J (4, 4), J'e (4,) and half the sum of squares [m^2] of the residual in position."""
 
     def residual(x: jax.Array) -> tuple:
         e = measured - simulated(run, base, x)
@@ -103,7 +108,7 @@ def gauss_newton(run: Replay, base: Axis, theta: jax.Array, measured: jax.Array)
 
 
 def costs(run: Replay, base: Axis, thetas: jax.Array, measured: jax.Array) -> jax.Array:
-    """Half the sum of squares of many parameter sets."""
+    """Return half the sum of squares [m^2] of each parameter set, (sets,)."""
 
     def cost(x: jax.Array) -> jax.Array:
         e = measured - simulated(run, base, x)
@@ -115,8 +120,7 @@ def costs(run: Replay, base: Axis, thetas: jax.Array, measured: jax.Array) -> ja
 class Compiled:
     """A function of a run, a plant and arrays, compiled for calls that cost microseconds.
 
-    `eqx.filter_jit` looks through all of the run at every call, which takes as long as a third of
-    a forward simulation.
+    `eqx.filter_jit` inspects all of the run at every call, which takes a third of a forward simulation.
     """
 
     def __init__(self, function: Callable, run: Replay, base: Axis):
@@ -131,7 +135,7 @@ class Compiled:
         return jax.block_until_ready(self._function(self._arrays, *args))
 
     def compile(self, *args: jax.Array) -> tuple[float, float, str]:
-        """CPU seconds of tracing and of compiling, and the compiled text."""
+        """Trace and compile; return the processor time of either [s], and the compiled text."""
         begin = time.process_time()
         lowered = self._function.lower(self._arrays, *args)
         traced = time.process_time()
@@ -140,7 +144,7 @@ class Compiled:
 
 
 def fit(run: Replay, base: Axis, theta: np.ndarray, measured: np.ndarray) -> Minimum:
-    """jaxid's own output-error fit."""
+    """Fit the position by jaxid's output-error method from some start, (4,)."""
     measured = jnp.asarray(measured)[:, None]
     weight, active = jnp.ones(measured.shape), np.ones(len(PLACES), bool)
     minimum = _fit(

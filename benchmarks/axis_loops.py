@@ -1,8 +1,8 @@
-"""What a person would write by hand for one axis in its cascade loop: loops compiled by numba.
+"""Loops for one axis in its cascade loop, written by hand and compiled by numba.
 
-`theta` is inertia, viscous coefficient, Coulomb level and constant force; `loop` holds what is
-known: gain, kp, kv, limit, period and the width of the smoothed sign. The velocity is the
-difference of two positions two ticks apart, as in `velocity_average = 2`.
+`theta` is inertia, viscous coefficient, Coulomb level and constant force; `loop` holds the known values:
+gain, kp, kv, limit, period and the width of the smoothed sign. The velocity is the difference of two
+positions two ticks apart, as in `velocity_average = 2`.
 """
 
 import math
@@ -15,7 +15,7 @@ P = 4
 
 @njit(cache=False)
 def command(r, q, past, loop):
-    """The cascade law, limited."""
+    """Return the command of the cascade law within its limit, before the drive's gain."""
     _, kp, kv, limit, period, _ = loop
     u = kv * (kp * (r - q) - (q - past) / (2 * period))
     return min(max(u, -limit), limit)
@@ -23,13 +23,14 @@ def command(r, q, past, loop):
 
 @njit(cache=False)
 def acceleration(v, u, theta, width):
+    """Return the acceleration [m/s^2] under a force u [N], with smoothed friction."""
     m, c, f, f0 = theta
     return (u - c * v - f * math.tanh(v / width) + f0) / m
 
 
 @njit(cache=False, nogil=True)
 def rk4_forward(theta, reference, loop, start, out):
-    """Smoothed friction, classical Runge-Kutta, one step a tick; positions into `out`."""
+    """Simulate smoothed friction by Runge-Kutta, one step a tick; write positions [m] to `out`, (time,)."""
     h, width = loop[4], loop[5]
     half = 0.5 * h
     q, v = start
@@ -51,7 +52,11 @@ def rk4_forward(theta, reference, loop, start, out):
 
 @njit(cache=False)
 def linear_flow(theta, h):
-    """Runge-Kutta's map of v' = (f - c v) / m over a step: what v and f give to v and q."""
+    """Return the Runge-Kutta map of v' = (f - c v) / m over a step h [s].
+
+    Returns:
+        Factors of v and f in the next v, then of v and f in the change of q.
+    """
     m, c, _, _ = theta
     z = -h * c / m
     grow = 1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))
@@ -62,7 +67,10 @@ def linear_flow(theta, h):
 
 @njit(cache=False, nogil=True)
 def ideal_forward(theta, reference, loop, start, out):
-    """Set-valued friction: the linear flow, then friction that stops, turns within the step or drags."""
+    """Simulate set-valued friction, one step a tick; write positions [m] to `out`.
+
+    After the linear flow friction stops the axis, turns within the step, or drags it.
+    """
     h = loop[4]
     vv, vf, qv, qf = linear_flow(theta, h)
     level, mobility = theta[2], h / theta[0]
@@ -95,8 +103,15 @@ def ideal_forward(theta, reference, loop, start, out):
 
 
 @njit(cache=False)
-def sensed(v, u, theta, width, dv, du, a, da):
-    """Acceleration and its derivative: by v and u, which have moved along dv and du, and theta."""
+def sensed(v, u, theta, width, dv, du, da):
+    """Return the acceleration, and write its derivative by the parameters to `da`, (4,).
+
+    Args:
+        v, u: Velocity [m/s] and force [N].
+        theta, width: Parameters, and the width of the smoothed sign [m/s].
+        dv, du: Derivatives of v and u by the parameters, (4,).
+        da: Array that the derivative is written to.
+    """
     m, c, f, f0 = theta
     t = math.tanh(v / width)
     a = (u - c * v - f * t + f0) / m
@@ -114,7 +129,11 @@ def sensed(v, u, theta, width, dv, du, a, da):
 
 @njit(cache=False)
 def rk4_normal(theta, reference, measured, loop, start, normal, gradient):
-    """Gauss-Newton of the position: J'J, J'e and e'e/2, sensitivities written by hand."""
+    """Write J'J to `normal` (4, 4) and J'e to `gradient` (4,), with sensitivities written by hand.
+
+    Returns:
+        Half the sum of squares of the residual in position [m^2].
+    """
     gain, kp, kv, limit, h, width = loop
     half = 0.5 * h
     q, v = start
@@ -137,19 +156,19 @@ def rk4_normal(theta, reference, measured, loop, start, normal, gradient):
         u = gain * min(max(raw, -limit), limit)
         for i in range(P):
             du[i] = -inside * kv * (kp * dq[i] + (dq[i] - dpast[i]) / (2 * h))
-        a1 = sensed(v, u, theta, width, dv, du, 0.0, e1)
+        a1 = sensed(v, u, theta, width, dv, du, e1)
         v2 = v + half * a1
         for i in range(P):
             d2[i] = dv[i] + half * e1[i]
-        a2 = sensed(v2, u, theta, width, d2, du, 0.0, e2)
+        a2 = sensed(v2, u, theta, width, d2, du, e2)
         v3 = v + half * a2
         for i in range(P):
             d3[i] = dv[i] + half * e2[i]
-        a3 = sensed(v3, u, theta, width, d3, du, 0.0, e3)
+        a3 = sensed(v3, u, theta, width, d3, du, e3)
         v4 = v + h * a3
         for i in range(P):
             d4[i] = dv[i] + h * e3[i]
-        a4 = sensed(v4, u, theta, width, d4, du, 0.0, e4)
+        a4 = sensed(v4, u, theta, width, d4, du, e4)
         past, last = last, q
         q += h / 6 * (v + 2 * v2 + 2 * v3 + v4)
         v += h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
@@ -162,7 +181,7 @@ def rk4_normal(theta, reference, measured, loop, start, normal, gradient):
 
 @njit(cache=False, parallel=True)
 def rk4_sets(thetas, reference, measured, loop, start, costs):
-    """Half the sum of squares of the position for many parameter sets, on all threads."""
+    """Write half the sum of squares [m^2] of each parameter set to `costs`, (sets,), on all threads."""
     for n in prange(len(thetas)):
         out = np.empty(len(reference))
         rk4_forward(thetas[n], reference, loop, start, out)

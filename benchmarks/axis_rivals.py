@@ -1,4 +1,4 @@
-"""The same axis by scipy, diffrax and optimistix: what one would otherwise call."""
+"""The axis of the speed benchmarks by scipy, diffrax and optimistix."""
 
 import equinox as eqx
 import jax
@@ -18,7 +18,14 @@ from jaxid.simulation.replay import Replay
 
 
 def lm_fit(loop_name: str, reference: np.ndarray, measured: np.ndarray, loop: tuple, start):
-    """scipy's Levenberg-Marquardt, finite differences through a numba loop."""
+    """Fit by scipy's Levenberg-Marquardt, with finite differences through a numba loop.
+
+    Args:
+        loop_name: "smooth" or "ideal" friction.
+        reference, measured: Positions [m], (time,).
+        loop: Known values of the loop; see `benchmarks.axis_loops`.
+        start: Parameters at the start, (4,).
+    """
     forward = {"smooth": rk4_forward, "ideal": ideal_forward}[loop_name]
     out = np.empty(len(reference))
 
@@ -31,13 +38,22 @@ def lm_fit(loop_name: str, reference: np.ndarray, measured: np.ndarray, loop: tu
 
 @njit
 def _rates(t, x, theta, force, period, width):
+    """Return the rates of position and velocity under a held force, for scipy."""
     m, c, f, f0 = theta
     u = force[min(int(t / period), len(force) - 1)]
     return np.array([x[1], (u - c * x[1] - f * np.tanh(x[1] / width) + f0) / m])
 
 
 def solve_ivp(theta: tuple, force: np.ndarray, period: float, width: float, atol: float) -> np.ndarray:
-    """RK45 at rtol 1e-6 under the held force that the loop gave; the right-hand side by numba."""
+    """Simulate the position [m], (time,), by scipy's RK45 at rtol 1e-6, with rates compiled by numba.
+
+    Args:
+        theta: Parameters, (4,).
+        force: Force of the loop [N], (time,), held from sample to sample.
+        period: Time between samples [s].
+        width: Width of the smoothed sign [m/s].
+        atol: Absolute tolerance of position [m] and velocity [m/s].
+    """
     times = period * np.arange(len(force))
     solution = scipy.integrate.solve_ivp(
         _rates,
@@ -54,7 +70,7 @@ def solve_ivp(theta: tuple, force: np.ndarray, period: float, width: float, atol
 
 @eqx.filter_jit
 def tsit5(base: Axis, force: jax.Array, period: float) -> jax.Array:
-    """diffrax's Tsit5, one step a sample, under the same force looked up by index."""
+    """Simulate the position [m], (time,), by diffrax's Tsit5, one step a sample, under a held force [N]."""
     times = period * jnp.arange(force.size)
 
     def held(t: jax.Array) -> jax.Array:
@@ -80,10 +96,20 @@ def optimistix_fit(
     measured: jax.Array,
     scaled: bool,
 ) -> tuple[jax.Array, jax.Array]:
-    """A solver of optimistix on jaxid's residual from jaxid's start: unknowns, half the sum of squares.
+    """Fit by a solver of optimistix, on the residual of jaxid and from its start.
 
-    Its damping is the same for all unknowns, so their scale matters: as jaxid's solver sees them,
-    or (`scaled`) with start and residual of order one, which a user would have to think of.
+    The damping of such a solver is the same for all unknowns, so that their scale matters.
+
+    Args:
+        solver: The solver.
+        run, base: The run, and the plant.
+        start: Parameters at the start, (4,).
+        measured: Measured position [m], (time,).
+        scaled: Whether start and residual are scaled to order one, which a user would do by hand; if not, the
+            unknowns have the scale of jaxid's solver.
+
+    Returns:
+        The parameters, (4,), and half the sum of squares [m^2].
     """
     unit = jnp.abs(start) if scaled else jnp.ones_like(start)
     inward, outward = (

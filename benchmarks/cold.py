@@ -1,4 +1,4 @@
-"""What commands cost in a fresh process: refusals, lists, `identify` on the demo, `discover` on hidden cases.
+"""Cost of commands in a fresh process: refusals, lists, `identify` on the demo, `discover` on hidden cases.
 
     python -m benchmarks.cold [--repeats 3] [--only TEXT] [--cases 5] [--long] [--no-write]
 
@@ -63,7 +63,7 @@ class Row:
 
 
 def timed(words: list[str], cache: Path, code: str = COMMAND, root: Path = ROOT) -> tuple[float, float, int]:
-    """Wall seconds, seconds of the processor, and exit status of one command."""
+    """Run one command; return wall time [s], processor time [s] and exit status."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", "XLA"))}
     environment |= {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(root)}
     begin = time.perf_counter()
@@ -81,7 +81,7 @@ def timed(words: list[str], cache: Path, code: str = COMMAND, root: Path = ROOT)
 
 
 def quickly_ended(folder: Path) -> dict[str, tuple[str, list[str]]]:
-    """Commands that need no fit: what they are, their group, and their words."""
+    """Return commands that need no fit: name -> group and arguments."""
     case, log = str(DEMO / "case.toml"), str(DEMO / "log.csv")
     text = (DEMO / "case.toml").read_text()
     faults = {
@@ -156,7 +156,7 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
 
 
 def long_searches() -> dict[str, Callable[[Path], list[str] | None]]:
-    """Searches that take minutes: what they are, and how to write their files."""
+    """Return searches that take minutes: name -> function that writes their files and returns arguments."""
     from benchmarks.long_searches import FIVE_BAR, arm, five_bar
 
     robots = {
@@ -167,7 +167,7 @@ def long_searches() -> dict[str, Callable[[Path], list[str] | None]]:
 
 
 def first_and_again(words: list[str], repeats: int) -> tuple[list, list]:
-    """Seconds with an empty cache, and with what that run has left there."""
+    """Run a command with an empty cache, and with what that run has left there; see `timed`."""
     first, again = [], []
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as room:
@@ -178,13 +178,13 @@ def first_and_again(words: list[str], repeats: int) -> tuple[list, list]:
 
 
 def searched(count: int) -> list[Case]:
-    """Some cases of `benchmarks.discovery`, spread over all of them."""
+    """Return some cases of `benchmarks.discovery`, spread over all of them."""
     every_case = list(every("test", 1))
     return every_case[:: max(1, len(every_case) // count)][:count]
 
 
 def line_of(row: Row) -> str:
-    """A row of the table in Markdown."""
+    """Return a row of the table in Markdown."""
     aim = "" if row.aim is None else f"{row.aim:g}"
     met = "" if row.aim is None else "yes" if row.wall <= row.aim else "**no**"
     seconds = (f"{row.wall:.2f}", f"{row.processor:.2f}")
@@ -214,7 +214,7 @@ def commit_of(root: Path) -> str:
 
 
 def origin() -> dict[str, str | int]:
-    """The machine and the versions."""
+    """Return the processor, its cores, and the versions of the packages."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -227,7 +227,7 @@ def origin() -> dict[str, str | int]:
 
 
 def kept_rows(rows: list[Row]) -> list[Row]:
-    """Rows of the file as it is that were not measured now, and then those that were."""
+    """Return the stored rows that were not measured now, and then those that were."""
     path = HERE / "results" / "cold.json"
     if not path.exists():
         return rows
@@ -238,7 +238,7 @@ def kept_rows(rows: list[Row]) -> list[Row]:
 
 
 def report(rows: list[Row], seen: dict[str, str | int]) -> str:
-    """The table in Markdown."""
+    """Return the page in Markdown."""
     head = "| command | wall s | processor s | repeats | exit status | aim, wall s | met | load | commit |"
     return "\n".join(
         [
@@ -253,7 +253,7 @@ def report(rows: list[Row], seen: dict[str, str | int]) -> str:
 
 
 def write_down(rows: list[Row]) -> None:
-    """Write the table; after each row, so that a run that is cut short leaves what it has measured."""
+    """Write the page; after each row, so that a run that is cut short leaves what it has measured."""
     seen = origin()
     (HERE / "results" / "cold.md").write_text(report(rows, seen))
     content = {**seen, "rows": [asdict(row) for row in rows]}

@@ -1,4 +1,4 @@
-"""How often `compare` names what differs between two machines, and how often it sees a difference in none.
+"""Rate at which `compare` names the difference of two machines, and one where there is none.
 
     python -m benchmarks.compare [--split test] [--count 100] [--only belt] [--minutes 3] [--resume]
 
@@ -75,7 +75,7 @@ def read(lines: Path) -> list[dict]:
 
 
 def run(pair: Pair, folder: Path) -> dict:
-    """Return what an oracle sees of a pair, and what jaxid says."""
+    """Compare the machines of a pair; return the oracle's evidence and the result of jaxid."""
     case = pair.write_case(folder)
     logs = [
         log if pair.scale == "belt" else Log(**(log | {"source": name}))
@@ -112,12 +112,12 @@ def _kind(label: str) -> str:
 
 
 def right(record: dict) -> bool:
-    """Return whether exactly what differs is named."""
+    """Check that exactly the difference is named."""
     return sorted(record["named"]) == sorted(record["names"])
 
 
 def listed(record: dict) -> bool:
-    """Return whether what differs is named, or stands among the alternatives of what is."""
+    """Check that the difference is named, or stands among the alternatives of a named one."""
     if len(record["named"]) != len(record["names"]):
         return False
     pairs = zip(record["named"], record["alternatives"], strict=True)
@@ -126,7 +126,7 @@ def listed(record: dict) -> bool:
 
 
 def summary(records: Sequence[dict], split: str) -> dict:
-    """Return the table, by what differs."""
+    """Return the table, by kind of difference."""
     rows = []
     for what in dict.fromkeys(r["what"] for r in records if r["names"]):
         own = [r for r in records if r["what"] == what]

@@ -3,9 +3,9 @@
     python -m benchmarks.control_step [CASE.toml] [--ticks 100000]
 
 The case (absent: two links, as in the tests) is simulated, and its readings are given to `jaxid.Live` one
-by one, as a machine's loop would. Times are of whole calls, from array to array; *in a scan* is what the
-law alone costs a tick within one compiled loop. On a machine that does other things the worst is theirs:
-processor time, of all threads, is what a machine of its own would take.
+by one, as the loop of a machine does. Times are of whole calls, from array to array; *in a scan* is the
+time of the law alone, a tick within one compiled loop. Other processes on the machine make the worst wall
+time longer; processor time, of all threads, is without them.
 """
 
 import argparse
@@ -40,7 +40,11 @@ def two_links(folder: Path, ticks: int) -> Path:
 
 
 def measured(case: Path, ticks: int) -> tuple[np.ndarray, float]:
-    """Wall and processor time of calls, (ticks, 2), and time of a tick in one compiled loop [us]."""
+    """Time the ticks of a case.
+
+    Returns:
+        Wall and processor time of each call [us], (ticks, 2), and time of a tick in one compiled loop [us].
+    """
     from jaxid.commands.live import Live
 
     live = Live(case)
@@ -62,7 +66,7 @@ def measured(case: Path, ticks: int) -> tuple[np.ndarray, float]:
 
 
 def rewind(live) -> None:
-    """Back to its start; its compiled law is kept."""
+    """Set a controller back to its start; its compiled law is kept."""
     live._tick, live.memory, live.switched = 0, live._controller.start(*first(live)), None
 
 
@@ -77,7 +81,7 @@ def first(live) -> tuple:
 
 
 def in_a_scan(live, readings: np.ndarray) -> float:
-    """Seconds a tick."""
+    """Time the law in one compiled loop; return seconds a tick."""
     import equinox as eqx
     import jax
     import jax.numpy as jnp

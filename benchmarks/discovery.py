@@ -1,4 +1,4 @@
-"""How often `discover` names what was hidden, and how often it names what is not there.
+"""Rate at which `discover` names a hidden effect, and one that is not there.
 
     python -m benchmarks.discovery [--split test] [--groups effects,pairs] [--only cogging] [--resume]
 
@@ -84,7 +84,7 @@ def _options() -> argparse.Namespace:
 
 
 def every(split: str, seeds: int) -> list[Case]:
-    """All cases of a split, on an axis and on chains."""
+    """Return all cases of a split, on an axis and on chains."""
     chains = hidden_chains.cases(split, seeds) if split in hidden_chains.FIRST_SEED else ()
     return [*hidden_cases.cases(split, seeds), *chains]
 
@@ -98,13 +98,13 @@ def _wanted(case: Case, options: argparse.Namespace) -> bool:
 
 
 def read(lines: Path) -> list[dict]:
-    """Records so far; a line that an interruption cut short is left out."""
+    """Return the records so far; a line that an interruption cut short is left out."""
     text = lines.read_text() if lines.exists() else ""
     return [json.loads(line) for line in text.split("\n")[:-1] if line.endswith("}")]
 
 
 def ask_again(lines: Path, cases: dict[str, Case]) -> None:
-    """Replace what the oracle said of cases that are done, where it has learned since."""
+    """Replace the oracle's evidence of cases that are done, after a change of the oracle."""
     from truth.hidden.bench import oracle
 
     records = read(lines)
@@ -148,7 +148,7 @@ def _work(group: Sequence[Case], lines: str) -> None:
 
 
 def measure_cold(chosen: Sequence[Case], path: Path) -> None:
-    """Seconds of a fresh `jaxid discover`, refits in simulation and all."""
+    """Time a fresh `jaxid discover` of each case, refits in simulation included, and write the times."""
     from truth.hidden.bench import write_files
 
     command = Path(sys.executable).parent / "jaxid"

@@ -1,4 +1,4 @@
-"""The table of the discovery bench, from its records."""
+"""The table of the benchmark of discovery, from its records."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
@@ -20,7 +20,7 @@ AIMS = {
 
 
 def summary(records: Sequence[Record], cold: Sequence[dict] = ()) -> dict:
-    """All that the table says, as JSON can hold it."""
+    """Return the content of the table, for JSON."""
     by = defaultdict(list)
     for r in records:
         by[r["group"]].append(r)
@@ -61,24 +61,24 @@ def summary(records: Sequence[Record], cold: Sequence[dict] = ()) -> dict:
 
 
 def aims_hold(table: dict) -> bool:
-    """Whether every aim that was measured is met."""
+    """Check that every aim that was measured is met."""
     return all(holds(name, value) for name, value in table["totals"].items() if value is not None)
 
 
 def holds(name: str, value: float) -> bool:
-    """Whether a total meets its aim."""
+    """Check that a total meets its aim."""
     bound, largest = AIMS[name]
     return value <= bound if largest else value >= bound
 
 
 def share(truths: Iterable[bool]) -> float | None:
-    """Part that is true; None of nothing."""
+    """Return the share of truths, or None if there are none."""
     truths = list(truths)
     return sum(truths) / len(truths) if truths else None
 
 
 def markdown(table: dict) -> str:
-    """The table for people."""
+    """Return the page in Markdown."""
     parts = ["# Discovery on hidden effects", _lines("Cases", table["counts"]), "## Aims"]
     rows = [
         [name, _text(value), f"{'<=' if AIMS[name][1] else '>='} {AIMS[name][0]:g}",
@@ -97,7 +97,7 @@ def markdown(table: dict) -> str:
 
 
 def glance(table: dict) -> str:
-    """Effect against noise, a line each: named right of visible, gap closed, seconds."""
+    """Return a line for each effect, by noise: named right of visible, gap closed, seconds."""
     noises = list(dict.fromkeys(r["noise"] for r in table["effects"]))
     rows = []
     for what in dict.fromkeys(r["what"] for r in table["effects"]):
@@ -138,7 +138,7 @@ def _row(what: str, noise: str, rows: Sequence[Record]) -> dict:
 
 
 def _closings(rows: Iterable[Record]) -> list[float]:
-    """Of every case that the oracle sees: one in which nothing was named closes nothing."""
+    """Return the closed part of the gap for the cases that the oracle sees; 0 if nothing was named."""
     return [c for r in rows if (c := judge.closed(r)) is not None]
 
 

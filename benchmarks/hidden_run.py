@@ -1,4 +1,4 @@
-"""One hidden case through jaxid: what it said, and what the truth itself would have closed."""
+"""One hidden case through jaxid: its result, and the gap that the true machine closes."""
 
 import math
 import time
@@ -17,7 +17,7 @@ Record = dict
 
 
 def run_case(case: Case, folder: Path) -> Record:
-    """The oracle's say, then jaxid's, as what JSON can hold."""
+    """Return the oracle's evidence and the result of jaxid, for JSON."""
     record = {
         "id": case.id, "group": case.group, "what": case.what, "scale": case.scale,
         "noise": case.noise, "seed": case.seed, "rate": case.rate, "hidden": list(case.names),
@@ -65,7 +65,7 @@ def _searched(case: Case, folder: Path) -> Record:
 
 
 def logged(case: Case, *, validation: bool = False) -> Log:
-    """What a user would have of a run."""
+    """Return the log of a run, with the columns of a user."""
     if isinstance(case, HiddenCase):
         return Log(**recorded(case.setup(validation=validation)))
     run, driven = case.run(validation=validation), case.machine.driven
@@ -74,7 +74,7 @@ def logged(case: Case, *, validation: bool = False) -> Log:
 
 
 def truth_gap(case: Case, folder: Path, logs: list) -> list[float]:
-    """RMS force residual of the true machine, through jaxid's own preprocessing, by log."""
+    """Return the RMS force residual of the true machine [N], prepared by jaxid, by log."""
     path = Path(folder) / "truth.toml"
     path.write_text(known_text(case))
     session = jaxid.open_session(path, logs[0], logs[1:], align_hold=True)
@@ -82,7 +82,7 @@ def truth_gap(case: Case, folder: Path, logs: list) -> list[float]:
 
 
 def _parameters(case: Case, d: object) -> dict[str, list]:
-    """Name -> true value, estimate, its standard deviation (null where it cannot be told)."""
+    """Return name -> true value, estimate, standard deviation; null where it is not identifiable."""
     names = d.after.machine.parameters.names
     out = {}
     for name, value, std in zip(names, d.after.theta, d.after.precision.std, strict=True):
@@ -106,7 +106,7 @@ def _outside(case: Case) -> dict | None:
 
 
 def _simulated(gap: Gap) -> list[list[float]] | None:
-    """Relative gap in simulation of position and, in a loop, of command; null where it diverged."""
+    """Return the relative gap in simulation of position and, in a loop, of command; null if it diverged."""
     s = gap.simulation
     if s is None:
         return None

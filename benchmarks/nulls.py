@@ -1,4 +1,4 @@
-"""How often discovery sees something where nothing is missing: logs of the stepper, all declared.
+"""Rate at which discovery names an effect where nothing is missing: complete cases, logs of the stepper.
 
     python -m benchmarks.nulls [--logs N] [--machine NAME] [--no-sensor]
 
@@ -26,7 +26,7 @@ MACHINES = {
 
 
 def judged(name: str, seed: int, noise: float, sensor: bool, folder: Path):
-    """What discovery says of one log."""
+    """Search one log, and return the verdict."""
     preset, motion, durations = MACHINES[name]
     setup = preset(seed, noise, durations[seed % len(durations)])
     declared = [*setup.machine.effects.items()]
@@ -40,7 +40,7 @@ def main() -> int:
     parser.add_argument("--logs", type=int, default=20, help="seeds at each level of noise")
     parser.add_argument("--machine", choices=MACHINES, default="emps_like")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--no-sensor", action="store_true", help="do not tell the sensor")
+    parser.add_argument("--no-sensor", action="store_true", help="do not state the sensor")
     options = parser.parse_args()
     wrong = total = 0
     with tempfile.TemporaryDirectory() as folder:

@@ -56,7 +56,7 @@ TX40_JOINT_4 = {"viscous_friction.coefficient": 1.11 / 48**2, "coulomb_friction.
 
 
 def resonance(values: Values) -> Values:
-    """Natural frequency and damping of the oscillator; `init` assumes 1000 samples a second."""
+    """Read natural frequency and damping of the oscillator; `init` assumes 1000 samples a second."""
     inertia, stiffness = values["inertia"], values["linear_stiffness.coefficient"]
     damping = values["viscous_friction.coefficient"] / (2 * sqrt(inertia * stiffness))
     frequency = sqrt(stiffness / inertia) / (2 * pi) * SILVERBOX_RATE / 1000.0

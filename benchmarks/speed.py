@@ -47,7 +47,7 @@ class Sides:
     def __init__(self):
         self.reference, self.measured = axis.log()
         self.base, self.theta = axis.plant(axis.TRUTH), jnp.asarray(axis.TRUTH)
-        self.known, self.seen = tuple(axis.TRUTH), jnp.asarray(self.measured)
+        self.theta_numba, self.measured_jax = tuple(axis.TRUTH), jnp.asarray(self.measured)
         self.runs = {
             name: axis.replay(self.reference, Numerics(set_valued=name == "ideal"))
             for name in ("smooth", "ideal")
@@ -66,22 +66,22 @@ class Sides:
         out = np.empty(len(self.reference))
 
         def run() -> np.ndarray:
-            function(self.known, self.reference, LOOP, REST, out)
+            function(self.theta_numba, self.reference, LOOP, REST, out)
             return out
 
         return run
 
     def force(self) -> np.ndarray:
-        """What the loop gives the axis: input of those who cannot close a sampled loop."""
+        """Return the force of the loop [N], (time,), for tools that cannot close a sampled loop."""
         return np.asarray(self.runs["smooth"](self.base).command)[:, 0] * axis.GAIN
 
     def normal(self, name: str) -> Callable:
         function = self.compiled(axis.gauss_newton, name)
-        return lambda: function(self.theta, self.seen)[0]
+        return lambda: function(self.theta, self.measured_jax)[0]
 
     def loop_normal(self) -> np.ndarray:
         normal, gradient = np.zeros((4, 4)), np.zeros(4)
-        loops.rk4_normal(self.known, self.reference, self.measured, LOOP, REST, normal, gradient)
+        loops.rk4_normal(self.theta_numba, self.reference, self.measured, LOOP, REST, normal, gradient)
         return normal
 
     def loop_sets(self) -> np.ndarray:
@@ -90,15 +90,16 @@ class Sides:
         return costs
 
     def two_threads(self, name: str) -> Callable:
-        """Vmapped groups, shared out between two threads: one vmap's lanes run on one core.
+        """Return a call that computes the cost of all sets, in vmapped groups on two threads.
 
-        Larger groups leave the first-level cache, smaller ones leave lanes of the core idle.
+        The lanes of one vmap run on one core. Larger groups leave the first-level cache, smaller ones leave
+        lanes of the core idle.
         """
         function = self.compiled(axis.costs, name)
         groups = [jnp.asarray(part) for part in np.split(self.sets, SETS // GROUP)]
 
         def one(group: np.ndarray) -> np.ndarray:
-            return np.asarray(function(group, self.seen))
+            return np.asarray(function(group, self.measured_jax))
 
         def run() -> np.ndarray:
             with ThreadPoolExecutor(2) as pool:
@@ -115,16 +116,18 @@ class Sides:
         return lambda: axis.fit(run, self.base, axis.START, self.measured).cost
 
     def optimistix_cost(self, name: str, solver: str, scaled: bool) -> Callable:
-        """Cost that a fit by optimistix reaches."""
+        """Return a call that fits by optimistix and returns half the sum of squares reached [m^2]."""
         run, start = self.runs[name], jnp.asarray(axis.START)
         method = rivals.OPTIMISTIX[solver]
-        return lambda: np.asarray(rivals.optimistix_fit(method, run, self.base, start, self.seen, scaled)[1])
+        return lambda: np.asarray(
+            rivals.optimistix_fit(method, run, self.base, start, self.measured_jax, scaled)[1]
+        )
 
     def scipy_fit(self, name: str) -> Callable:
         return lambda: rivals.lm_fit(name, self.reference, self.measured, LOOP, axis.START).x
 
     def many_fits(self, name: str, *, scipy: bool) -> Callable:
-        """Fits from as many starts as there are sets, shared out between two threads."""
+        """Return a call that fits from each of the sets, on two threads; its result is (sets, 4)."""
         run = self.runs[name]
 
         def one(start: np.ndarray) -> np.ndarray:
@@ -140,13 +143,19 @@ class Sides:
 
 
 def comparisons(sides: Sides, n: int, few: int) -> list[Row]:
-    """Every comparison; n repeats, fewer of what takes long."""
+    """Compare jaxid with every rival on one log.
+
+    Args:
+        sides: Both sides.
+        n: Number of repeats.
+        few: Number of repeats of slow calls.
+    """
     rk4, ideal = sides.loop_forward(loops.rk4_forward), sides.loop_forward(loops.ideal_forward)
     sets, force = jnp.asarray(sides.sets), sides.force()
     vmapped = sides.compiled(axis.costs, "smooth")
     jacobian = sides.compiled(axis.jacobian, "smooth")
     of_jacobian = lambda: (lambda j: np.asarray(j.T @ j))(jacobian(sides.theta))
-    ivp = lambda atol: rivals.solve_ivp(sides.known, force, axis.PERIOD, WIDTH, atol)
+    ivp = lambda atol: rivals.solve_ivp(sides.theta_numba, force, axis.PERIOD, WIDTH, atol)
     tsit5 = lambda: rivals.tsit5(sides.base, jnp.asarray(force), axis.PERIOD)
     smooth, exact = sides.forward("smooth"), sides.forward("ideal")
     loop, by_hand = "numba loop", "numba, sensitivities by hand"
@@ -169,7 +178,7 @@ def comparisons(sides: Sides, n: int, few: int) -> list[Row]:
                 0.1),
         compare("1024 fits, 2 threads, ideal", sides.many_fits("ideal", scipy=False),
                 lm + ", ideal, 2 threads", sides.many_fits("ideal", scipy=True), None, few, 1e-3),
-        compare("1024 sets, one vmap", lambda: vmapped(sets, sides.seen), prange, sides.loop_sets,
+        compare("1024 sets, one vmap", lambda: vmapped(sets, sides.measured_jax), prange, sides.loop_sets,
                 None, few, 1e-6),
         compare("1024 sets, 2 threads", sides.two_threads("smooth"), prange, sides.loop_sets,
                 0.35, few, 1e-6),
@@ -185,7 +194,7 @@ def comparisons(sides: Sides, n: int, few: int) -> list[Row]:
 
 
 def against_optimistix(sides: Sides, n: int, cold: int) -> list[Row]:
-    """Fits by jaxid's solver and by those of optimistix: the same residual, start and cost reached."""
+    """Compare fits by jaxid's solver with those by optimistix, on the same residual from the same start."""
     rows = []
     for name in ("smooth", "ideal"):
         what = "fit, {}" + (", ideal" if name == "ideal" else "") + " (cost)"
@@ -202,7 +211,7 @@ def against_optimistix(sides: Sides, n: int, cold: int) -> list[Row]:
 
 
 def cold_row(quantity: str, name: str, solver: str, repeats: int) -> Row:
-    """First fits of fresh processes in turn, tracing and compiling included."""
+    """Compare the first fits of fresh processes in turn, tracing and compiling included."""
     pairs = np.array(
         [
             [json.loads(in_process(*COLD_FIT, name, *who)[1].splitlines()[-1]) for who in ((), (solver,))]
@@ -225,12 +234,12 @@ def cold_row(quantity: str, name: str, solver: str, repeats: int) -> Row:
 
 
 def compile_times(sides: Sides) -> dict[str, dict]:
-    """Seconds of tracing and compiling, and whether the loop flag was taken."""
+    """Time tracing and compiling [s], and check whether the compiled loops have the loop flag."""
     out = {}
     for name in ("smooth", "ideal"):
         for label, function, args in (
             ("forward", axis.simulated, (sides.theta,)),
-            ("Gauss-Newton step", axis.gauss_newton, (sides.theta, sides.seen)),
+            ("Gauss-Newton step", axis.gauss_newton, (sides.theta, sides.measured_jax)),
         ):
             traced, compiled, text = sides.compiled(function, name).compile(*args)
             flag = 'xla_cpu_small_call="true"' in text
@@ -239,7 +248,7 @@ def compile_times(sides: Sides) -> dict[str, dict]:
 
 
 def cold_fits(repeats: int) -> dict[str, tuple[float, float]]:
-    """First fit of a fresh process, without and with compiled code on disk [s, CPU s]."""
+    """Time the first fit of a process, without and with compiled code on disk: wall and processor [s]."""
     out = {}
     for name in ("smooth", "ideal"):
         with tempfile.TemporaryDirectory() as folder:
@@ -259,7 +268,7 @@ def cold_fits(repeats: int) -> dict[str, tuple[float, float]]:
 
 
 def start_times(repeats: int) -> dict[str, float]:
-    """Import and help in a fresh process, less what Python itself takes [s]."""
+    """Time import and help in a fresh process, without the start of Python itself [s]."""
     words = {"nothing": ("-c", "pass"), "import jaxid": ("-c", "import jaxid")}
     words["import jaxid, with JAX"] = ("-c", "import jaxid, jaxid.simulation.loops")
     if (HERE.parent / "jaxid" / "cli.py").exists():

@@ -1,8 +1,8 @@
-"""The same axis by tools that engineers would otherwise take, where they are installed.
+"""The axis of the speed benchmarks by other tools for identification, as far as they are installed.
 
 MuJoCo's sysid closes the loop by an affine servo, continuous where the controller is sampled, and fits a
-log of its own making, so that its model can be right. jax-sysid fits the sampled loop, one explicit step a
-sample; figaroh builds the regressor of a motion by Pinocchio, sample by sample.
+simulated log of this servo, so that its model can be right. jax-sysid fits the sampled loop, one explicit
+step a sample; figaroh builds the regressor of a motion by Pinocchio, sample by sample.
 """
 
 from collections.abc import Callable
@@ -159,7 +159,7 @@ class Figaroh:
 
 
 class Regressor:
-    """The same by jaxid."""
+    """Least squares on jaxid's regressor of a motion that is known."""
 
     def __init__(self, motion: tuple[np.ndarray, ...], force: np.ndarray):
         columns = [jnp.asarray(x)[:, None] for x in (*motion, force)]
@@ -175,14 +175,14 @@ class Regressor:
 
 
 def motion_of(run: np.ndarray, velocity: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Position, velocity and acceleration of a run, and the force that they ask for."""
+    """Return position, velocity and acceleration of a run, and the force of the balance [N], each (time,)."""
     acceleration = np.gradient(velocity, axis.PERIOD)
     m, c, f, f0 = axis.TRUTH
     return (run, velocity, acceleration), m * acceleration + c * velocity + f * np.sign(velocity) - f0
 
 
 def against_peers(sides: object, few: int) -> list[Row]:
-    """Rows of the tools that are installed."""
+    """Compare jaxid with the tools that are installed."""
     rows = []
     if installed("mujoco"):
         peer = MuJoCo(sides.reference)

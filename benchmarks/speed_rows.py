@@ -1,4 +1,4 @@
-"""Rows of the speed benchmark: two functions timed in turn, once they are seen to give the same."""
+"""Rows of the speed benchmark: two functions timed in turn, after a check that their results are equal."""
 
 import os
 import subprocess
@@ -21,11 +21,11 @@ class Row:
     """One comparison.
 
     Args:
-        quantity: What is computed.
+        quantity: Name of the computation.
+        rival: Name of the alternative.
         jaxid, alternative: Medians [s].
-        rival: What it is compared with.
         ratio: jaxid over alternative, of the medians.
-        best: The same of the fastest runs: what other load on the machine touches least.
+        best: The same of the fastest runs, which other load on the machine affects least.
         difference: Largest difference of the results, relative to their size.
         aim: Target of the ratio; None: none.
     """
@@ -41,11 +41,12 @@ class Row:
 
     @property
     def met(self) -> bool:
-        """By the fastest runs: other load on the machine must not decide."""
+        """Check the aim by the fastest runs, because other load on the machine must not decide."""
         return self.aim is None or self.best <= self.aim
 
 
 def timed(function: Callable) -> float:
+    """Return the time of a call [s]."""
     begin = time.perf_counter()
     function()
     return time.perf_counter() - begin
@@ -90,7 +91,7 @@ def line(row: Row) -> str:
 
 
 def in_process(*words: str, **environment: str) -> tuple[float, str]:
-    """Wall time and output of a fresh Python in the checkout."""
+    """Run a fresh Python in the checkout; return its wall time [s] and its output."""
     begin = time.perf_counter()
     done = subprocess.run(
         [sys.executable, *words],

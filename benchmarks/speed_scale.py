@@ -1,6 +1,6 @@
-"""What fits cost against cores, length of the log, masses and joints, and what commands cost from cold.
+"""Cost of fits against cores, length of the log, masses and joints; and of commands in a fresh process.
 
-Each number is of a fresh process: peak memory is a process's, and so are its cores.
+Each number is of a fresh process, because peak memory and cores belong to a process.
 """
 
 import json
@@ -34,7 +34,17 @@ PATIENCE, FAILED = 600.0, 0.05
 
 
 def child(what: str, *words: object, cores: int | None = None, patience: float | None = None) -> dict:
-    """What a fresh process prints of itself, on so many cores."""
+    """Run one measurement in a fresh process on some cores, and return the record that it prints.
+
+    Args:
+        what: Name of the measurement: study, fit or joints.
+        words: Its arguments.
+        cores: Number of cores; None: all.
+        patience: Time after which the process is ended [s]; None: none.
+
+    Raises:
+        subprocess.TimeoutExpired: If it takes longer.
+    """
     prefix = [] if cores is None else ["taskset", "-c", f"0-{cores - 1}"]
     line = [*prefix, sys.executable, "-m", "benchmarks.speed_scale", what, *map(str, words)]
     options = {"capture_output": True, "text": True, "check": True, "cwd": HERE.parent}
@@ -43,7 +53,7 @@ def child(what: str, *words: object, cores: int | None = None, patience: float |
 
 
 def study_row(name: str, runs: int, processes: int, cores: int) -> dict:
-    """A study on so many cores; without a time if it does not end."""
+    """Measure a study on some cores; the row has no time if the study does not end in time."""
     row = {"case": name, "cores": cores}
     try:
         return row | child("study", name, runs, processes, cores=cores, patience=PATIENCE)
@@ -52,9 +62,17 @@ def study_row(name: str, runs: int, processes: int, cores: int) -> dict:
 
 
 def study(name: str, runs: int, processes: int = 0) -> dict:
-    """Milliseconds a run of a study: of a second one in the same process, whole; the first compiles.
+    """Measure a whole study, the second in its process: the first one compiles.
 
-    On threads, or on so many processes of a thread each, behind a scheduler of their own.
+    Args:
+        name: Name of the case, of `CASES`.
+        runs: Number of runs.
+        processes: Number of worker processes of one thread each, behind a scheduler; 0: threads of this
+            process.
+
+    Returns:
+        `ms`, time of a run [ms]; `first_s`, the study that compiles [s]; `failed`, runs; `memory`, peak
+        [bytes].
     """
     if processes:
         from distributed import LocalCluster
@@ -90,7 +108,12 @@ def _study(name: str, runs: int, scheduler: str | None = None) -> dict:
 
 
 def fit(samples: int, repeats: int) -> dict:
-    """One log of so many samples: seconds of simulating, preparing and fitting, cold and warm."""
+    """Measure one log: simulation, preparation, and fits by two methods, cold and warm [s].
+
+    Args:
+        samples: Number of samples of the log.
+        repeats: Number of warm repeats, of which the median is taken.
+    """
     import jaxid
     from jaxid.estimators import METHODS
     from jaxid.numerics.lanes import run_alone
@@ -110,7 +133,7 @@ def fit(samples: int, repeats: int) -> dict:
 
 
 def lasting(samples: int) -> str:
-    """The study's case with its reference repeated, or cut, to so many samples."""
+    """Return the case of the study, with its reference repeated or cut to a number of samples at 1 kHz."""
     text, seconds = FITS.read_text(), samples / 1000
     found = re.search(r"targets = \[(.*)\]", text)
     times = max(1, int(np.ceil(seconds / 25.0)))
@@ -123,7 +146,17 @@ def lasting(samples: int) -> str:
 
 
 def joints(kind: str, count: int, samples: int, repeats: int) -> dict:
-    """So many masses or joints in their loop, two unknowns each: a run, a Gauss-Newton step, compiling."""
+    """Measure a machine of several masses or joints in its loop, with two unknowns each.
+
+    Args:
+        kind: "chain" or "arm".
+        count: Number of masses or joints.
+        samples: Number of samples at 1 kHz.
+        repeats: Number of warm repeats, of which the fastest is taken.
+
+    Returns:
+        Times of a simulated run and of a Gauss-Newton step [ms], and of compiling either [s].
+    """
     import jax
     import jax.numpy as jnp
 
@@ -155,7 +188,7 @@ def joints(kind: str, count: int, samples: int, repeats: int) -> dict:
 
 
 def chain_case(masses: int, seconds: float) -> str:
-    """A chain, every mass driven, its masses and friction unknown."""
+    """Return the case of a chain with a drive at every mass; masses and friction are unknown."""
     each = lambda value: f"[{', '.join([value] * masses)}]"
     plant = f"""
 [plant]
@@ -174,7 +207,7 @@ joint = [{", ".join(str(k + 1) for k in range(masses))}]
 
 
 def arm_case(count: int, seconds: float) -> str:
-    """The first joints of the PA-10 with bodies and rotors of its size, the friction unknown."""
+    """Return the case of the first joints of the PA-10, with bodies of its size; friction is unknown."""
     from jaxid.plants import pa10
 
     table = pa10()
@@ -226,7 +259,7 @@ sample_rate = 1000.0
 
 
 def commands() -> list[dict]:
-    """Seconds of every command on the demo's log: nothing compiled before, and run once more."""
+    """Time every command on the log of the demo, with an empty cache and once more [s]."""
     demo = HERE.parent / "jaxid" / "demo"
     case, log, other = (str(demo / name) for name in ("case.toml", "log.csv", "validation.csv"))
     words = {
@@ -259,7 +292,11 @@ def commands() -> list[dict]:
 
 
 def measured(*, quick: bool) -> dict:
-    """All of it."""
+    """Measure all parts of the page.
+
+    Args:
+        quick: Whether repeats are few, and the largest sizes are left out.
+    """
     n = os.cpu_count() or 1
     repeats = 2 if quick else 5
     out = {"study": [], "lengths": [], "joints": []}
@@ -281,7 +318,7 @@ def measured(*, quick: bool) -> dict:
 
 
 def tables(found: dict) -> list[str]:
-    """In Markdown."""
+    """Return the lines of the page in Markdown."""
     met = lambda value, aim: "yes" if value <= aim else "**no**"
     megabytes = lambda x: f"{x / 2**20:.0f}"
     lines = ["## Fits by the study", "",
@@ -335,6 +372,7 @@ def tables(found: dict) -> list[str]:
 
 
 def _timed(function: object, repeats: int) -> list[float]:
+    """Return the time of each of several calls [s]."""
     seconds = []
     for _ in range(repeats):
         begin = time.perf_counter()
@@ -344,7 +382,7 @@ def _timed(function: object, repeats: int) -> list[float]:
 
 
 def _memory() -> int:
-    """Most memory that this process has held [bytes]; what `getrusage` says may be its parent's."""
+    """Return the peak memory of this process [bytes]; that of `getrusage` may be its parent's."""
     found = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
     return 1024 * int(found[1])
 

@@ -1,4 +1,4 @@
-"""How far the effects of the benchmark of discovery stand above the noise, by its oracle alone.
+"""Evidence of the effects of the benchmark of discovery, by its oracle alone.
 
     python -m benchmarks.visibility [--split test]
 
