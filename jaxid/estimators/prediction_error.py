@@ -131,23 +131,63 @@ def prediction_error_steps(
     if len(settings) > 1 and (hessian or profile):
         what = "hessian" if hessian else "profile"
         raise InputError(f"{what} of innovations goes with one log", hint="leave it out, or name one log")
-    fit = _joined(machine, settings, start, numerics)
 
+    fit = _joined(machine, settings, start, numerics)
+    theta, noises, screened = yield from _best_start(fit, start, alone=alone)
+    fit, lowest = yield from _by_floors(fit, theta, noises)
+    fit, end = yield from _with_samples_at_rest(fit, lowest)
+    end = replace(end, steps=screened + end.steps)
+
+    theta, reads = end.theta, [np.zeros(m.drives) for m in fit.members]
+    if end.converged:
+        theta, reads = yield from _corrected_steps(fit, end)
+    estimate = _estimate(fit, end, theta, reads)
+    if estimate.converged:
+        estimate = yield from _with_bound_at_truth(estimate, fit, lowest.noises)
+    if hessian:
+        estimate = yield from _by_hessian(estimate, fit, end)
+    if profile:
+        estimate = yield from _with_profiles(estimate, fit, end, theta, profile)
+    return estimate
+
+
+def _best_start(
+    fit: JointLikelihood, start: np.ndarray | None, *, alone: bool
+) -> Steps[tuple[np.ndarray, list[np.ndarray], int]]:
+    """Choose the best of several starts by a few steps of a fit from each.
+
+    Args:
+        fit: The likelihood.
+        start: Start of another method, (p,); None: there is none.
+        alone: Whether the guesses of shapes are taken as they are.
+
+    Returns:
+        The unknowns, (p,), the noises of each log, and the number of steps.
+    """
     # Beside another method's start the guesses matter for shapes only, whose likelihood has several maxima.
-    parameters, noises, steps = machine.parameters, [m.at.noise for m in fit.members], 0
-    shapes = [] if alone else shape_starts(machine, parameters.guess)
+    parameters, noises = fit.machine.parameters, [m.at.noise for m in fit.members]
+    shapes = [] if alone else shape_starts(fit.machine, parameters.guess)
     starts = [parameters.guess, *shapes] if shapes or start is None else []
     if start is not None:
         starts.insert(0, np.clip(start, *parameters.bounds))
-    theta, trials = starts[0], []
-    for at in starts if len(starts) > 1 else ():
+    if len(starts) == 1:
+        return starts[0], noises, 0
+    trials = []
+    for at in starts:
         trials.append((yield from fit.fit(at, noises, _SCREENING)))
-    if trials:
-        best = min(trials, key=lambda trial: np.nan_to_num(trial.cost, nan=np.inf))
-        theta, noises = best.theta, best.noises
-        steps = sum(trial.steps for trial in trials)
+    best = min(trials, key=lambda trial: np.nan_to_num(trial.cost, nan=np.inf))
+    return best.theta, best.noises, sum(trial.steps for trial in trials)
 
-    end = None
+
+def _by_floors(
+    fit: JointLikelihood, theta: np.ndarray, noises: list[np.ndarray]
+) -> Steps[tuple[JointLikelihood, Maximum]]:
+    """Maximise under one floor of the noise after the other, until the noise is above its floor.
+
+    Returns:
+        The likelihood under the last floor, and its maximum with the steps of all.
+    """
+    end, steps = None, 0
     for floor in range(len(fit.members[0].at.floors)):
         fit = fit.at_floor(floor)
         end = yield from fit.fit(theta, noises, STEPS)
@@ -155,40 +195,49 @@ def prediction_error_steps(
         if fit.above(floor, end) or not np.isfinite(end.cost):
             break
     assert end is not None, "there is at least one floor"
+    return fit, replace(end, steps=steps)
 
-    # Without noise of the force it is known when a joint sticks, and samples at rest count too. If the noise
-    # rises with them, it holds the error of the steps in which a joint comes to rest: then they do not count.
-    sure = fit.sticks_surely(noises)
+
+def _with_samples_at_rest(fit: JointLikelihood, end: Maximum) -> Steps[tuple[JointLikelihood, Maximum]]:
+    """Count the samples at rest too, in the logs in which it is known when a joint sticks.
+
+    It is known without noise of the force. If the noise rises with these samples, it holds the error of the
+    steps in which a joint comes to rest: then they do not count.
+    """
+    steps, sure = end.steps, fit.sticks_surely(end.noises)
     while any(sure):
         rested = fit.at_rest_too(sure)
-        other = yield from rested.fit(theta, noises, STEPS)
+        other = yield from rested.fit(end.theta, end.noises, STEPS)
         steps += other.steps
         still = [s and after for s, after in zip(sure, fit.sticks_surely(other.noises), strict=True)]
         if still == sure:
-            fit, end, theta = rested, other, other.theta
-            break
+            return rested, replace(other, steps=steps)
         sure = still
+    return fit, replace(end, steps=steps)
 
-    reads = [np.zeros(m.drives) for m in fit.members]
-    if end.converged:
-        theta, reads = yield from _corrected_steps(fit, end)
-    end = replace(end, steps=steps)
-    estimate = _estimate(fit, end, theta, reads)
 
-    true = [free.true for free in parameters.free]
-    if true and None not in true and estimate.converged:
-        truth = np.array(true, dtype=np.float64)
-        there = yield from fit.fit(truth, noises, 1)
-        bound = _precision(fit, _rows(fit, there, truth), truth).std
-        values = dict(zip(parameters.names, bound.tolist(), strict=True))
-        estimate = replace(estimate, details={**estimate.details, "least_std": values})
-    if hessian:
-        estimate = yield from _by_hessian(estimate, fit, end)
-    if not profile:
+def _with_bound_at_truth(
+    estimate: Estimate, fit: JointLikelihood, noises: list[np.ndarray]
+) -> Steps[Estimate]:
+    """Add the least standard deviations, by the information at the true values, if all are stated."""
+    free = fit.machine.parameters.free
+    true = [f.true for f in free]
+    if not true or None in true:
         return estimate
+    truth = np.array(true, dtype=np.float64)
+    there = yield from fit.fit(truth, noises, 1)
+    bound = _precision(fit, _rows(fit, there, truth), truth).std
+    values = dict(zip(fit.machine.parameters.names, bound.tolist(), strict=True))
+    return replace(estimate, details={**estimate.details, "least_std": values})
+
+
+def _with_profiles(
+    estimate: Estimate, fit: JointLikelihood, end: Maximum, theta: np.ndarray, names: Sequence[str]
+) -> Steps[Estimate]:
+    """Add the profile likelihoods of some unknowns of one log."""
     [member], [scored] = fit.members, end.scored
     profiles, notes = yield from profile_steps(
-        member.problem, machine, theta, scored, estimate.precision, profile
+        member.problem, fit.machine, theta, scored, estimate.precision, names
     )
     return replace(
         estimate, notes=(*estimate.notes, *notes), details={**estimate.details, "profiles": profiles}

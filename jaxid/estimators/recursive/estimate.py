@@ -21,7 +21,14 @@ from jaxtyping import Float
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.recursive.precision import details_of, precision_of, weights_together
-from jaxid.estimators.recursive.recursion import Recursion, RecursiveMemory, column_squares, instants, run
+from jaxid.estimators.recursive.recursion import (
+    Recursion,
+    RecursiveEstimate,
+    RecursiveMemory,
+    column_squares,
+    instants,
+    run,
+)
 from jaxid.estimators.recursive.rows import Rows, rows_steps
 from jaxid.estimators.several.force import inverse_dynamics_steps
 from jaxid.estimators.several.parts import Part
@@ -92,6 +99,11 @@ class _Run:
         used = self.used
         return Residual(used.rows, used.rows @ theta - used.target, used.counts, used.size)
 
+    def shown_residual(self, theta: np.ndarray) -> np.ndarray:
+        """Return the residual of the used rows in its unit, NaN where a row does not count."""
+        used = self.used
+        return np.where(used.counts, used.rows @ theta - used.target, np.nan) / self.scale
+
     def scaled(self, factor: float) -> _Run:
         """Return the log with rows, target and force times a factor."""
         rows, used = self.rows.scaled(factor), self.used.scaled(factor)
@@ -124,79 +136,43 @@ def recursive_steps(
         InputError: If the balance is not linear in the unknowns, a gain has no known term to scale it, an
             instrument has no gain, or rows of different units are to be summed.
     """
-    noisy = settings.instrument == "model"
     _check(machine, settings, gains_of(machine), saved)
-    parts, logs = [] if isinstance(log, Prepared) else list(log), []
-    if isinstance(log, Prepared):
-        members = [("fit", machine, log, np.arange(len(machine.parameters.free)))]
-    else:
-        members = [(part.name, part.machine, part.data, part.index) for part in parts]
-    for name, own, data, index in members:
-        gains = tuple(None if g is None else int(index[g]) for g in gains_of(own))
-        rows = yield from rows_steps(own, data, _gates(data, settings))
-        rows = rows.widened(index, len(machine.parameters.free))
-        logs.append(_Run(name, data, rows, rows.summed if settings.rows == "summed" else rows, gains))
+    logs = yield from _logs_of(machine, log, settings)
     _check_rows(machine, logs)
-    if len(parts) > 1:
-        logs = yield from _of_equal_noise(machine, parts, logs)
+    if not isinstance(log, Prepared) and len(log) > 1:
+        logs = yield from _of_equal_noise(machine, log, logs)
 
     used = Rows.joined([each.used for each in logs])
     recursion, memory = _recursion(machine, logs[0], used, settings)
     if saved is not None:
-        recursion = replace(recursion, start=saved["start"], information=saved["information"])
-        memory = RecursiveMemory(**{k: jnp.asarray(v) for k, v in saved["memory"].items()})
+        recursion, memory = _continued(recursion, saved)
+    course = yield from _run_along(recursion, memory, logs, settings)
 
-    every, samples = max(1, -(-len(used.rows) // _MOST)), [len(each.rows.rows) for each in logs]
-    factors, histories, instruments, times, began = [], [], [], [], 0.0
-    for each in logs:
-        recursion = replace(recursion, gains=each.gains, forgetting=_forgetting(each, settings))
-        rows = each.rows
-        memory, history, z = yield SolveRequest(
-            run, (recursion, memory, rows.rows, rows.target, rows.counts, every)
-        )
-        factors.append(float(recursion.forgetting))
-        histories.append(jax.tree.map(np.asarray, history))
-        instruments.append(each.used.rows if z is None else np.asarray(z))
-        # The logs stand one behind the other in time.
-        times.append(began + each.data.times[instants(len(rows.rows), every)])
-        began = float(times[-1][-1]) + each.period
-    history = jax.tree.map(lambda *x: np.concatenate(x), *histories)
-    theta = history.theta[-1]
-    weight = weights_together([each.used for each in logs], factors)
+    theta = course.history.theta[-1]
     precision, inflation = precision_of(
         machine,
         used,
-        np.concatenate(instruments),
-        recursion,
-        history,
-        every,
-        saved is None,
-        weight,
-        _blocks(samples, every),
-        samples,
+        course.instruments,
+        course.recursion,
+        course.history,
+        course.every,
+        whole=saved is None,
+        weight=weights_together([each.used for each in logs], course.forgetting),
+        block=course.blocks,
+        logs=course.samples,
     )
+    shown = details_of(
+        machine, course.recursion, course.memory, course.history, course.times, inflation, settings
+    )
+    details: dict[str, Any] = {"recursive": shown}
+    notes = list(_notes(machine, theta, settings, len(logs)))
+    if len(logs) > 1:
+        details["fits"] = _facts_by_log(logs, float(course.history.noise[-1]))
+        if settings.half_life is None:
+            residuals = [each.residual(theta) for each in logs]
+            notes += disagreement(residuals, int(precision.identifiable.sum()))
 
     converged = bool(np.all(np.isfinite(theta)))
-    residual = [
-        np.where(own.counts, own.rows @ theta - own.target, np.nan) / each.scale
-        for each, own in ((each, each.used) for each in logs)
-    ]
-    details: dict[str, Any] = {
-        "recursive": details_of(
-            machine, recursion, memory, history, np.concatenate(times), inflation, settings
-        )
-    }
-    contrary: list[str] = []
-    if len(logs) > 1:
-        if settings.half_life is None:
-            contrary = disagreement(
-                [each.residual(theta) for each in logs], int(precision.identifiable.sum())
-            )
-        entries = [
-            {"samples": int(each.used.counts.sum()), "noise": float(history.noise[-1]) / each.scale}
-            for each in logs
-        ]
-        details["fits"] = dict(zip([each.name for each in logs], entries, strict=True))
     return Estimate(
         method="recursive",
         machine=machine.with_estimate(theta),
@@ -204,11 +180,103 @@ def recursive_steps(
         precision=precision,
         converged=converged,
         message="converged" if converged else "the estimate is not finite",
-        residual=np.concatenate(residual),
+        residual=np.concatenate([each.shown_residual(theta) for each in logs]),
         samples=int(used.counts.sum()),
-        notes=(*_notes(machine, theta, settings, noisy, len(logs)), *contrary),
+        notes=tuple(notes),
         details=details,
     )
+
+
+def _logs_of(machine: Machine, log: Prepared | Sequence[Part], settings: Recursive) -> Steps[list[_Run]]:
+    """Compute the rows of each log, by the unknowns of all."""
+    unknowns = len(machine.parameters.free)
+    if isinstance(log, Prepared):
+        members = [("fit", machine, log, np.arange(unknowns))]
+    else:
+        members = [(part.name, part.machine, part.data, part.index) for part in log]
+    logs = []
+    for name, on_log, data, index in members:
+        gains = tuple(None if g is None else int(index[g]) for g in gains_of(on_log))
+        rows = yield from rows_steps(on_log, data, _gates(data, settings))
+        rows = rows.widened(index, unknowns)
+        logs.append(_Run(name, data, rows, rows.summed if settings.rows == "summed" else rows, gains))
+    return logs
+
+
+def _continued(recursion: Recursion, saved: Mapping[str, Any]) -> tuple[Recursion, RecursiveMemory]:
+    """Return the estimator and the memory of an earlier run."""
+    recursion = replace(recursion, start=saved["start"], information=saved["information"])
+    return recursion, RecursiveMemory(**{k: jnp.asarray(v) for k, v in saved["memory"].items()})
+
+
+@dataclass(frozen=True)
+class _Course:
+    """Course of the estimates along all logs, of n samples in all and h instants in the history.
+
+    Args:
+        recursion: The estimator, as it ran along the last log.
+        memory: Its memory at the end.
+        history: The estimates, by instant.
+        times: Time of each instant, with the logs one behind the other [s], (h,).
+        instruments: Instruments, or the rows themselves if there are none, (n, m, p).
+        every: Number of samples between two instants.
+        samples: Number of samples of each log.
+        forgetting: Factor of a sample's weight at the next sample, by log.
+    """
+
+    recursion: Recursion
+    memory: RecursiveMemory
+    history: RecursiveEstimate
+    times: np.ndarray
+    instruments: np.ndarray
+    every: int
+    samples: list[int]
+    forgetting: list[float]
+
+    @property
+    def blocks(self) -> np.ndarray:
+        """Number of the estimate after each sample in the history, (n,)."""
+        out, first = [], 0
+        for count in self.samples:
+            out.append(first + np.arange(count) // self.every)
+            first += -(-count // self.every)
+        return np.concatenate(out)
+
+
+def _run_along(
+    recursion: Recursion, memory: RecursiveMemory, logs: Sequence[_Run], settings: Recursive
+) -> Steps[_Course]:
+    """Run the estimator along the logs, one after the other."""
+    samples = [len(each.rows.rows) for each in logs]
+    every = max(1, -(-sum(samples) // _MOST))
+    histories, times, instruments, forgetting, began = [], [], [], [], 0.0
+    for each in logs:
+        recursion = replace(recursion, gains=each.gains, forgetting=_forgetting(each, settings))
+        rows = each.rows
+        memory, history, z = yield SolveRequest(
+            run, (recursion, memory, rows.rows, rows.target, rows.counts, every)
+        )
+        histories.append(jax.tree.map(np.asarray, history))
+        instruments.append(each.used.rows if z is None else np.asarray(z))
+        forgetting.append(float(recursion.forgetting))
+        # The logs stand one behind the other in time.
+        times.append(began + each.data.times[instants(len(rows.rows), every)])
+        began = float(times[-1][-1]) + each.period
+    return _Course(
+        recursion=recursion,
+        memory=memory,
+        history=jax.tree.map(lambda *x: np.concatenate(x), *histories),
+        times=np.concatenate(times),
+        instruments=np.concatenate(instruments),
+        every=every,
+        samples=samples,
+        forgetting=forgetting,
+    )
+
+
+def _facts_by_log(logs: Sequence[_Run], noise: float) -> dict[str, dict[str, Any]]:
+    """Return the number of samples and the noise of each log; `noise` is that of the first."""
+    return {each.name: {"samples": int(each.used.counts.sum()), "noise": noise / each.scale} for each in logs}
 
 
 def _of_equal_noise(machine: Machine, parts: Sequence[Part], logs: Sequence[_Run]) -> Steps[list[_Run]]:
@@ -220,15 +288,6 @@ def _of_equal_noise(machine: Machine, parts: Sequence[Part], logs: Sequence[_Run
     first = yield from inverse_dynamics_steps(machine, parts)
     noises = [first.details["fits"][part.name]["noise"] for part in parts]
     return [each.scaled(noises[0] / noise) for each, noise in zip(logs, noises, strict=True)]
-
-
-def _blocks(samples: Sequence[int], every: int) -> np.ndarray:
-    """Return for each sample of all logs the number of the estimate after it in the history."""
-    out, first = [], 0
-    for count in samples:
-        out.append(first + np.arange(count) // every)
-        first += -(-count // every)
-    return np.concatenate(out)
 
 
 def _forgetting(log: _Run, settings: Recursive) -> np.ndarray:
@@ -330,16 +389,14 @@ def _check_rows(machine: Machine, logs: Sequence[_Run]) -> None:
             )
 
 
-def _notes(
-    machine: Machine, theta: np.ndarray, settings: Recursive, instrument: bool, logs: int
-) -> tuple[str, ...]:
+def _notes(machine: Machine, theta: np.ndarray, settings: Recursive, logs: int) -> tuple[str, ...]:
     """Return the notes about forgetting, bounds and instruments."""
     lower, upper = machine.parameters.bounds
     out = [n for n, o in zip(machine.parameters.names, (theta < lower) | (theta > upper), strict=True) if o]
     notes = (
         [f"outside the bounds of sign or case, which this method ignores: {', '.join(out)}"] if out else []
     )
-    if instrument:
+    if settings.instrument == "model":
         notes.append("instruments: the drive's force that the model fitted by least squares predicts")
     if logs > 1:
         notes.append(f"the {logs} logs were run one after the other, as they are named")
