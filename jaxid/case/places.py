@@ -26,61 +26,93 @@ def read_ports(
         InputError: If a place does not exist on the plant, or does not go with the effect.
     """
     places = [name for name in PLACES if name in table]
-    driven_only = cls.in_drive or cls.needs_drive
     if len(places) > 1:
         raise spot.fault(f"{' and '.join(places)} exclude each other", f"keep one: {places[0]}")
-    parts, springs = plant.cls.bodies(plant.joints), plant.cls.springs(plant.joints)
-    if cls.with_springs not in (None, springs > 0):
-        has, hint = (
-            ("no springs", "chain or flexible_axis")
-            if cls.with_springs
-            else (
-                "springs",
-                "axis, or state the spring there",
-            )
-        )
-        raise spot.fault(f"{cls.kind} does not go with a plant that has {has}", f"use a {hint}")
-    shafts = len(plant.options.get("shafts", ()))
-    passives, tools = plant.cls.passives, plant.cls.tools
-    there = {"spring": springs, "shaft": shafts, "passive": passives, "tool": tools}
-    for name in (name for name in places if name in there):
-        if not there[name]:
-            hint = f"leave {name} out: the effect then acts on the joint"
-            if name == "shaft" and plant.cls.linked:
-                hint = "add [[plant.shafts]] with the joints that it turns with, or name joints"
-            what = f"does not exist on kind = '{plant.cls.kind}'"
-            raise spot.at(name).refuse(table[name], what, hint)
-    if "spring" in table:
+    _need_suitable_plant(cls, plant, spot)
+    joints, springs = plant.cls.bodies(plant.joints), plant.cls.springs(plant.joints)
+    if not places:
+        return _default_ports(cls, plant)
+    [place] = places
+    if place == "joint":
+        return _joints(table, cls, plant, spot), place
+
+    passives = plant.cls.passives
+    number = {
+        "spring": springs,
+        "shaft": len(plant.options.get("shafts", ())),
+        "passive": passives,
+        "tool": plant.cls.tools,
+    }[place]
+    _need_places(table, place, number, plant, spot)
+    _need_suitable_effect(table, place, cls, spot)
+    # Other ports are numbered from the joints on; tools follow the passive angles.
+    before = joints + passives if place == "tool" else joints
+    return tuple(before + k for k in _places(table, place, number, spot)), place
+
+
+def _need_suitable_plant(cls: type[Effect], plant: PlantEntry, spot: Spot) -> None:
+    """Refuse an effect that needs springs on a plant without them, or the reverse."""
+    springs = plant.cls.springs(plant.joints) > 0
+    if cls.with_springs in (None, springs):
+        return
+    has, hint = (
+        ("no springs", "chain or flexible_axis")
+        if cls.with_springs
+        else ("springs", "axis, or state the spring there")
+    )
+    raise spot.fault(f"{cls.kind} does not go with a plant that has {has}", f"use a {hint}")
+
+
+def _need_places(table: dict[str, Any], place: str, number: int, plant: PlantEntry, spot: Spot) -> None:
+    """Refuse a kind of place that the plant does not have."""
+    if number:
+        return
+    hint = f"leave {place} out: the effect then acts on the joint"
+    if place == "shaft" and plant.cls.linked:
+        hint = "add [[plant.shafts]] with the joints that it turns with, or name joints"
+    raise spot.at(place).refuse(table[place], f"does not exist on kind = '{plant.cls.kind}'", hint)
+
+
+def _need_suitable_effect(table: dict[str, Any], place: str, cls: type[Effect], spot: Spot) -> None:
+    """Refuse an effect that cannot act on a kind of place other than a joint."""
+    given, at = table[place], spot.at(place)
+    if place == "spring":
         if not cls.of_spring:
             hint = "name a joint; on springs act the stiffness effects"
-            raise spot.at("spring").refuse(table["spring"], f"does not go with {cls.kind}", hint)
-        chosen = _places(table, "spring", springs, spot)
-        return tuple(parts + k for k in chosen), "spring"
-    for name, before in (("shaft", parts), ("passive", parts), ("tool", parts + passives)):
-        if name not in table:
-            continue
-        if driven_only:
-            what, hint = f"has no command for {cls.kind} to act on", "name the joint of the drive"
-            raise spot.at(name).refuse(table[name], what, hint)
-        if name == "tool" and not cls.any_direction:
-            uniform = "effects that are the same in all directions (added_mass, viscous_friction)"
-            hint = f"name a joint; on a tool act {uniform}"
-            raise spot.at(name).refuse(table[name], f"does not go with {cls.kind}", hint)
-        return tuple(before + k for k in _places(table, name, there[name], spot)), name
-    if "joint" in table:
-        chosen = _places(_numbered(table, plant.names, spot), "joint", parts, spot)
-        actuated = range(plant.joints) if plant.actuated is None else plant.actuated
-        undriven = plant.actuated is not None and not set(chosen) <= set(actuated)
-        if driven_only and undriven:
-            driven = ", ".join(str(k + 1) for k in actuated)
-            what = f"has no drive for {cls.kind} to sit in"
-            raise spot.at("joint").refuse(table["joint"], what, f"driven is: {driven}")
-        return chosen, "joint"
+            raise at.refuse(given, f"does not go with {cls.kind}", hint)
+        return
+    if _only_on_drives(cls):
+        hint = "name the joint of the drive"
+        raise at.refuse(given, f"has no command for {cls.kind} to act on", hint)
+    if place == "tool" and not cls.any_direction:
+        uniform = "effects that are the same in all directions (added_mass, viscous_friction)"
+        hint = f"name a joint; on a tool act {uniform}"
+        raise at.refuse(given, f"does not go with {cls.kind}", hint)
+
+
+def _only_on_drives(cls: type[Effect]) -> bool:
+    return cls.in_drive or cls.needs_drive
+
+
+def _joints(table: dict[str, Any], cls: type[Effect], plant: PlantEntry, spot: Spot) -> tuple[int, ...]:
+    """Read the joints on which an effect acts, 0-based, and refuse those without the drive that it needs."""
+    joints = plant.cls.bodies(plant.joints)
+    chosen = _places(_numbered(table, plant.names, spot), "joint", joints, spot)
+    if _only_on_drives(cls) and plant.actuated is not None and not set(chosen) <= set(plant.actuated):
+        driven = ", ".join(str(k + 1) for k in plant.actuated)
+        what = f"has no drive for {cls.kind} to sit in"
+        raise spot.at("joint").refuse(table["joint"], what, f"driven is: {driven}")
+    return chosen
+
+
+def _default_ports(cls: type[Effect], plant: PlantEntry) -> tuple[tuple[int, ...], str]:
+    """Return all ports that suit an effect, 0-based, and their noun."""
+    joints, springs = plant.cls.bodies(plant.joints), plant.cls.springs(plant.joints)
     if cls.of_spring and springs:
-        return tuple(range(parts, parts + springs)), "spring"
-    if driven_only and plant.actuated is not None:
+        return tuple(range(joints, joints + springs)), "spring"
+    if _only_on_drives(cls) and plant.actuated is not None:
         return plant.actuated, "joint"
-    return tuple(range(parts)), "joint"
+    return tuple(range(joints)), "joint"
 
 
 def _numbered(table: dict[str, Any], names: tuple[str, ...], spot: Spot) -> dict[str, Any]:

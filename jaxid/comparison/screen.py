@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ from jaxid.discovery import evidence as ev
 from jaxid.discovery.columns import NOTHING_NEW
 from jaxid.discovery.noise import fit_whitener
 from jaxid.discovery.screen import all_columns, has_influence
+from jaxid.model.unknowns import Free
 
 # Number of surrogates from which the threshold is estimated.
 _SURROGATES = 200
@@ -124,10 +125,10 @@ class _Whole:
     def new(self, more: _Sums) -> np.ndarray:
         """Return which columns are no combination of those of the model."""
         total, beside = self.gram.sum(axis=0), more.base.sum(axis=0)
-        own = np.einsum("bkk->k", more.gram)
+        size = np.einsum("bkk->k", more.gram)
         ridge = _RIDGE * np.diag(np.maximum(np.diag(total), 1e-300))
-        rest = own - np.sum(beside * np.linalg.solve(total + ridge, beside), axis=0)
-        return rest > NOTHING_NEW**2 * np.maximum(own, 1e-300)
+        rest = size - np.sum(beside * np.linalg.solve(total + ridge, beside), axis=0)
+        return rest > NOTHING_NEW**2 * np.maximum(size, 1e-300)
 
     def amount(self, more: _Sums) -> float:
         """Return the coefficient of one column in a fit of the residual beside those of the model."""
@@ -205,64 +206,97 @@ def _scored(
 
     largest = np.full(e[0].shape[1] - 1, -np.inf)
     scores: list[Scored] = []
-    unknowns = model.unknowns
     names = superset.machine.parameters.names
     for change in parameter_changes(model, names, comparable, len(base)):
-        column = {u.logs: j for j, u in enumerate(unknowns) if u.index == change.index}
-        parts = []
-        for k in change.logs:
-            j = [next(j for logs, j in column.items() if k in logs)]
-            parts.append(_Sums(grams[k][:, :, j], grams[k][:, j][:, :, j], mixed[k][:, j]))
-        sums = _beside(parts) if change.apart else sum(parts[1:], start=parts[0])
+        sums = _parameter_sums(change, model, grams, mixed)
         if whole.new(sums).any():
             gained = evidence(whole.held_out(sums, False))
             largest = np.maximum(largest, gained[1:])
             scores.append(Scored(change, float(gained[0])))
 
-    sums_of = [
-        _points(own, w, x, y) for own, w, x, y in zip(points, whitened.whiteners, base, e, strict=True)
-    ]
-    free = superset.machine.parameters.free
+    sums_of = [_points(p, w, x, y) for p, w, x, y in zip(points, whitened.whiteners, base, e, strict=True)]
     for change in effects:
-        c = change.effect
-        assert c is not None, "an effect"
         found: list[tuple[float, np.ndarray]] = []
-        for start in range(len(c.starts)):
-            key = (id(c), start)
-            own = [sums_of[k][key] for k in change.logs if key in sums_of[k]]
-            if len(own) < len(change.logs):
-                continue
-            sums, shifted = sum(own[1:], start=own[0]), not c.amplitude.any()
-            # A change of the residual comes last, and is no column that could be old.
-            kept = whole.new(sums)
-            kept[-1] |= shifted
-            if kept.sum() <= shifted:
-                continue
-            sums = _chosen(sums, kept)
-            gained = evidence(whole.held_out(sums, shifted))
+        for trial in _trials(change, sums_of, whole, superset.machine.parameters.free):
+            gained = evidence(whole.held_out(trial.sums, trial.shifted))
             largest = np.maximum(largest, gained[1:])
-            guess = c.starts[start]
-            if c.amplitude.any():
-                strength = np.where(c.amplitude, c.starts[start], 0.0)
-                amount = whole.amount(_combined(sum(own[1:], start=own[0]), strength))
-                bound = any(free[i].sign != "free" for i, a in zip(c.index, c.amplitude, strict=True) if a)
-                if bound and amount <= 0:
-                    continue
-                guess = np.where(c.amplitude, amount, 1.0) * c.starts[start]
-            found.append((float(gained[0]), guess))
+            if trial.guess is not None:
+                found.append((float(gained[0]), trial.guess))
         if found:
             found.sort(key=lambda pair: -pair[0])
-            # A linear screen exaggerates a start of an effect that is not linear: the next best is tried too.
-            most = 1 if c.amplitude.all() or c.has_grid else 2
-            scores.append(Scored(change, found[0][0], tuple(guess for _, guess in found[:most])))
+            guesses = tuple(guess for _, guess in found[: _guesses_kept(change)])
+            scores.append(Scored(change, found[0][0], guesses))
 
-    separate = [ev.held_out(g, m, s) for g, m, s in zip(map(_own, grams), mixed, squares, strict=True)]
+    separate = [
+        ev.held_out(g, m, s) for g, m, s in zip(map(_without_other_logs, grams), mixed, squares, strict=True)
+    ]
     apart = evidence(np.sum(separate, axis=0))
     scores.sort(key=lambda s: -s.evidence)
     return Screen(whitened, float(before[0]), tuple(scores), largest, float(apart[0]), apart[1:])
 
 
-def _own(gram: np.ndarray) -> np.ndarray:
+def _parameter_sums(
+    change: Change, model: Model, grams: Sequence[np.ndarray], mixed: Sequence[np.ndarray]
+) -> _Sums:
+    """Return the sums of the columns of a parameter in the logs of a change."""
+    column = {u.logs: j for j, u in enumerate(model.unknowns) if u.index == change.index}
+    parts = []
+    for k in change.logs:
+        j = [next(j for logs, j in column.items() if k in logs)]
+        parts.append(_Sums(grams[k][:, :, j], grams[k][:, j][:, :, j], mixed[k][:, j]))
+    return _beside(parts) if change.apart else sum(parts[1:], start=parts[0])
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """An effect at one start.
+
+    Args:
+        sums: Sums of its new columns.
+        shifted: Whether the last of them is a change of the residual.
+        guess: Values from which a fit would begin; None: the effect would act against its sign.
+    """
+
+    sums: _Sums
+    shifted: bool
+    guess: np.ndarray | None
+
+
+def _trials(
+    change: Change, sums_of: Sequence[dict[tuple[int, int], _Sums]], whole: _Whole, free: Sequence[Free]
+) -> Iterator[_Trial]:
+    """Yield an effect at each of its starts, if it has columns in all logs of a change that are new."""
+    c = change.effect
+    assert c is not None, "an effect"
+    for k, start in enumerate(c.starts):
+        by_log = [sums_of[log][id(c), k] for log in change.logs if (id(c), k) in sums_of[log]]
+        if len(by_log) < len(change.logs):
+            continue
+        sums, shifted = sum(by_log[1:], start=by_log[0]), not c.amplitude.any()
+        # A change of the residual comes last, and is no column that could be old.
+        kept = whole.new(sums)
+        kept[-1] |= shifted
+        if kept.sum() <= shifted:
+            continue
+        guess = start
+        if not shifted:
+            amount = whole.amount(_combined(sums, np.where(c.amplitude, start, 0.0)))
+            bound = any(free[i].sign != "free" for i, a in zip(c.index, c.amplitude, strict=True) if a)
+            guess = None if bound and amount <= 0 else np.where(c.amplitude, amount, 1.0) * start
+        yield _Trial(_chosen(sums, kept), shifted, guess)
+
+
+def _guesses_kept(change: Change) -> int:
+    """Return how many starts of an effect are tried.
+
+    A linear screen exaggerates a start of an effect that is not linear: the next best is tried too.
+    """
+    c = change.effect
+    assert c is not None, "an effect"
+    return 1 if c.amplitude.all() or c.has_grid else 2
+
+
+def _without_other_logs(gram: np.ndarray) -> np.ndarray:
     """Return products of the columns of one log, of which those of other logs are zero."""
     size = np.einsum("bkk->k", gram)
     return gram + np.diag(np.where(size > 0, 0.0, 1.0))

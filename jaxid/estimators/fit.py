@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.controllers import Controller
 from jaxid.errors import InputError, suggest
-from jaxid.estimators.common.levenberg_marquardt import Transform, eliminated
+from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, eliminated
 from jaxid.estimators.common.minimise import minimise
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.simulated_output import output_residual
@@ -130,27 +130,9 @@ def fit(
     drive = replace(replay.drive, substeps=substeps, set_valued=sticks and solver is None, solver=step)
     replay = replace(replay, drive=drive)
 
-    # The unknowns are the parameters, followed by changes of the initial position and velocity.
-    n = measured.shape[1]
-    nuisance = 0 if initial is not None else 2 * n
-    wide = jnp.full(nuisance, jnp.inf)
-    transform = Transform(np.array([*(s == "positive" for s in signs), *[False] * nuisance], dtype=bool))
-    floors = {"free": -np.inf, "nonnegative": 0.0, "positive": _POSITIVE_FLOOR}
-    floor = jnp.asarray([floors[s] for s in signs])
-    lower = jnp.where(np.array([s == "positive" for s in signs]), floor * jnp.abs(theta), floor)
+    minimum = _minimum(replay, plant, places, signs, theta, measured, initial is None, minimiser)
     counts = jnp.isfinite(measured)
-    residual = output_residual(
-        replay, places, plant, jnp.where(counts, measured, 0.0), counts.astype(jnp.float64)
-    )
-    minimum = minimise(
-        residual,
-        jnp.concatenate([theta, jnp.zeros(nuisance)]),
-        transform,
-        jnp.concatenate([lower, -wide]),
-        jnp.concatenate([jnp.full(len(places), jnp.inf), wide]),
-        minimiser=minimiser_of(minimiser),
-    )
-
+    n, nuisance = measured.shape[1], minimum.theta.size - len(places)
     theta, moved = minimum.theta[: len(places)], minimum.theta[len(places) :]
     moved = moved if nuisance else jnp.zeros(2 * n)
     return Fit(
@@ -163,6 +145,48 @@ def fit(
         residual=minimum.residual.reshape(measured.shape),
         position=replay.position + moved[:n],
         velocity=replay.velocity + moved[n:],
+    )
+
+
+def _minimum(
+    replay: Replay,
+    plant: Plant,
+    places: tuple,
+    signs: Sequence[str],
+    theta: Array,
+    measured: Array,
+    fits_initial: bool,
+    minimiser: str | Minimiser | None,
+) -> Minimum:
+    """Minimise the residual in position over the parameters, followed by changes of the initial state.
+
+    Args:
+        replay: The run.
+        plant: The plant.
+        places, signs: Place and sign of each free parameter.
+        theta: Parameters at the start, (p,).
+        measured: Measured positions, (time, n); NaN where there is no reading.
+        fits_initial: Whether the initial positions and velocities are unknown.
+        minimiser: Minimiser of `fit`.
+    """
+    nuisance = 2 * measured.shape[1] if fits_initial else 0
+    wide = jnp.full(nuisance, jnp.inf)
+    transform = Transform(np.array([*(s == "positive" for s in signs), *[False] * nuisance], dtype=bool))
+    floors = {"free": -np.inf, "nonnegative": 0.0, "positive": _POSITIVE_FLOOR}
+    floor = jnp.asarray([floors[s] for s in signs])
+    lower = jnp.where(np.array([s == "positive" for s in signs]), floor * jnp.abs(theta), floor)
+
+    counts = jnp.isfinite(measured)
+    residual = output_residual(
+        replay, places, plant, jnp.where(counts, measured, 0.0), counts.astype(jnp.float64)
+    )
+    return minimise(
+        residual,
+        jnp.concatenate([theta, jnp.zeros(nuisance)]),
+        transform,
+        jnp.concatenate([lower, -wide]),
+        jnp.concatenate([jnp.full(len(places), jnp.inf), wide]),
+        minimiser=minimiser_of(minimiser),
     )
 
 

@@ -58,6 +58,16 @@ class Scored(eqx.Module):
 
 
 class _Trial(eqx.Module):
+    """State of the iteration: the best point so far, and the next one to try.
+
+    Args:
+        best: Likelihood at the best point.
+        normal: Information there, (p, p).
+        trial: Next point, (p,).
+        predicted: Fall of the cost that the quadratic model predicts for it [nats].
+        growth: Factor of the damping if the trial is rejected.
+    """
+
     best: Scored
     normal: Array
     trial: Array
@@ -87,30 +97,9 @@ def maximise_likelihood(
         Nielsen (1999), IMM-REP-1999-05.
     """
     x = jnp.clip(x, lower, upper)
-    p = x.size
-
-    def pair(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        e, variance = outputs(x)
-        return (e, jnp.log(variance)), (e, variance)
-
-    def evaluate(x: Array) -> tuple[Array, Array, Array, tuple[Array, Array, Array]]:
-        """Return cost, gradient, information, and the arrays of `Scored`."""
-        (slope, log_slope), (e, variance) = jax.jacfwd(pair, has_aux=True)(x)
-        root = jnp.sqrt(variance)
-        z = jnp.where(counts, e / root, 0.0)
-        mean = jnp.where(counts[..., None], slope / root[..., None], 0.0)
-        spread = jnp.where(counts[..., None], log_slope, 0.0)
-
-        cost = 0.5 * jnp.sum(z**2 + jnp.where(counts, jnp.log(variance), 0.0))
-        gradient = jnp.einsum("tk,tkp->p", z, mean) + 0.5 * jnp.einsum("tk,tkp->p", 1 - z**2, spread)
-
-        rows, logs = mean.reshape(-1, p), spread.reshape(-1, p)
-        # Far from the optimum the observed information on a variance exceeds the expected one.
-        weight = jnp.maximum(jnp.square(z).ravel(), 1.0)[:, None]
-        return cost, gradient, rows.T @ rows + 0.5 * logs.T @ (weight * logs), (z, mean, spread)
 
     def advance(s: _Trial) -> _Trial:
-        cost, gradient, normal, arrays = evaluate(s.trial)
+        cost, gradient, normal, arrays = _evaluated(outputs, counts, s.trial)
         was = s.best
         # A shape that a log does not show may run to a value at which the likelihood has no slope.
         sound = jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
@@ -124,16 +113,7 @@ def maximise_likelihood(
         shrink = jnp.where(first, 1.0, jnp.where(gain < 0.5, 0.5, 0.1))
         damping = jnp.where(better, was.damping * shrink, was.damping * s.growth)
         growth = jnp.where(better, 2.0, 2 * s.growth)
-
-        # An unknown that presses against a bound rests.
-        rests = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
-        size = jnp.sqrt(jnp.maximum(jnp.diag(normal), 1e-300))
-        scaled = jnp.where(rests[:, None] | rests[None, :], 0.0, normal / jnp.outer(size, size))
-        scaled = scaled + jnp.diag(jnp.where(rests, 1.0, damping + 1e-14))
-        whole = -jnp.linalg.solve(scaled, jnp.where(rests, 0.0, gradient) / size) / size
-        trial = jnp.clip(x + whole, lower, upper)
-        predicted = -(gradient @ whole + 0.5 * whole @ normal @ whole)
-        cut = jnp.any(trial != x + whole)
+        trial, predicted, cut = _next_trial(x, gradient, normal, damping, lower, upper)
 
         done = (little & (s.predicted < _TOLERANCE)) | (~cut & (predicted < 0.1 * _TOLERANCE))
         done |= (damping > _STUCK) | ((was.steps > 10) & ~jnp.isfinite(cost))
@@ -151,21 +131,66 @@ def maximise_likelihood(
         )
         return _Trial(best, normal, trial, predicted, growth)
 
-    empty = jnp.zeros((*counts.shape, p))
-    start = Scored(
+    first = _Trial(_unevaluated(x, counts), jnp.eye(x.size), x, jnp.asarray(0.0), jnp.asarray(2.0))
+    end = jax.lax.while_loop(lambda s: ~s.best.done & (s.best.steps < max_steps), advance, first)
+    return end.best
+
+
+def _evaluated(
+    outputs: Callable[[Array], tuple[Array, Array]], counts: Array, x: Array
+) -> tuple[Array, Array, Array, tuple[Array, Array, Array]]:
+    """Return cost, gradient (p,), information (p, p), and the arrays of `Scored` at a point."""
+    p = x.size
+
+    def pair(x: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        e, variance = outputs(x)
+        return (e, jnp.log(variance)), (e, variance)
+
+    (slope, log_slope), (e, variance) = jax.jacfwd(pair, has_aux=True)(x)
+    root = jnp.sqrt(variance)
+    z = jnp.where(counts, e / root, 0.0)
+    mean = jnp.where(counts[..., None], slope / root[..., None], 0.0)
+    spread = jnp.where(counts[..., None], log_slope, 0.0)
+
+    cost = 0.5 * jnp.sum(z**2 + jnp.where(counts, jnp.log(variance), 0.0))
+    gradient = jnp.einsum("tk,tkp->p", z, mean) + 0.5 * jnp.einsum("tk,tkp->p", 1 - z**2, spread)
+
+    rows, logs = mean.reshape(-1, p), spread.reshape(-1, p)
+    # Far from the optimum the observed information on a variance exceeds the expected one.
+    weight = jnp.maximum(jnp.square(z).ravel(), 1.0)[:, None]
+    return cost, gradient, rows.T @ rows + 0.5 * logs.T @ (weight * logs), (z, mean, spread)
+
+
+def _next_trial(
+    x: Array, gradient: Array, normal: Array, damping: Array, lower: Array, upper: Array
+) -> tuple[Array, Array, Array]:
+    """Return the damped step's end within the bounds, the fall that it predicts, and if a bound cut it."""
+    # An unknown that presses against a bound rests.
+    rests = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+    size = jnp.sqrt(jnp.maximum(jnp.diag(normal), 1e-300))
+    scaled = jnp.where(rests[:, None] | rests[None, :], 0.0, normal / jnp.outer(size, size))
+    scaled = scaled + jnp.diag(jnp.where(rests, 1.0, damping + 1e-14))
+    whole = -jnp.linalg.solve(scaled, jnp.where(rests, 0.0, gradient) / size) / size
+
+    trial = jnp.clip(x + whole, lower, upper)
+    predicted = -(gradient @ whole + 0.5 * whole @ normal @ whole)
+    return trial, predicted, jnp.any(trial != x + whole)
+
+
+def _unevaluated(x: Array, counts: Array) -> Scored:
+    """Return the state at a start whose likelihood is not known yet."""
+    empty = jnp.zeros((*counts.shape, x.size))
+    return Scored(
         x=x,
         cost=jnp.asarray(jnp.inf),
         z=jnp.zeros(counts.shape),
         mean=empty,
         log_variance=empty,
-        gradient=jnp.zeros(p),
+        gradient=jnp.zeros(x.size),
         damping=jnp.asarray(_DAMPING),
         steps=jnp.asarray(0),
         done=jnp.asarray(False),
     )
-    first = _Trial(start, jnp.eye(p), x, jnp.asarray(0.0), jnp.asarray(2.0))
-    end = jax.lax.while_loop(lambda s: ~s.best.done & (s.best.steps < max_steps), advance, first)
-    return end.best
 
 
 def observed_information(
