@@ -6,6 +6,8 @@ nothing is filtered here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -86,27 +88,18 @@ class RealTime(eqx.Module):
                 changes with time, or the balance is not linear in an unknown.
         """
         n, names, places = machine.plant.joints, machine.parameters.names, machine.parameters.places
-        sizes = {"period": period, "noise": noise, "spread": spread, "half_life": half_life}
-        for name, value in {**sizes, "gate_velocity": gate_velocity}.items():
-            if not np.all(np.asarray(value, float) > 0):
-                raise InputError(f"{name} = {value} is not positive", where="RealTime", hint="it must be > 0")
+        _need_positive(
+            period=period, noise=noise, spread=spread, half_life=half_life, gate_velocity=gate_velocity
+        )
         # A negative gate would let samples at rest through.
         if not np.all(np.asarray(gate_acceleration, float) >= 0):
             what = f"gate_acceleration = {gate_acceleration} is negative"
             raise InputError(what, where="RealTime", hint="it must be >= 0")
-        for name, value in {"spread": spread, "start": spread if start is None else start}.items():
-            if np.shape(value) != (len(names),):
-                hint = f"give one value for each of {', '.join(names)}"
-                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", hint=hint)
-        for name, value in {"gate_velocity": gate_velocity, "gate_acceleration": gate_acceleration}.items():
-            if np.shape(value) not in ((), (1,), (n,)):
-                hint = f"give one value for all joints, or {n}"
-                raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", hint=hint)
+        _need_value_each(names, spread=spread, start=spread if start is None else start)
+        velocity = _by_joint("gate_velocity", gate_velocity, n)
+        acceleration = _by_joint("gate_acceleration", gate_acceleration, n)
 
         check_instant(machine, "RealTime")
-        velocity, acceleration = (
-            np.broadcast_to(np.asarray(x, float), (n,)) for x in (gate_velocity, gate_acceleration)
-        )
         plant = machine.plant.smoothed(
             np.asarray(1 / 3), typical_velocity(machine.plant, velocity[None], np.min)
         )
@@ -203,3 +196,25 @@ class RealTime(eqx.Module):
     def told(self, memory: RecursiveMemory) -> RecursiveEstimate:
         """Return `estimate(memory)`; the name of version 0.1."""
         return self.estimate(memory)
+
+
+def _need_positive(**values: float | np.ndarray) -> None:
+    for name, value in values.items():
+        if not np.all(np.asarray(value, float) > 0):
+            raise InputError(f"{name} = {value} is not positive", where="RealTime", hint="it must be > 0")
+
+
+def _need_value_each(names: Sequence[str], **values: np.ndarray) -> None:
+    """Refuse arrays that do not have one value for each unknown."""
+    for name, value in values.items():
+        if np.shape(value) != (len(names),):
+            hint = f"give one value for each of {', '.join(names)}"
+            raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", hint=hint)
+
+
+def _by_joint(name: str, value: float | np.ndarray, joints: int) -> Float[np.ndarray, " n"]:
+    """Return a value for each joint, from one for all of them or one each."""
+    if np.shape(value) not in ((), (1,), (joints,)):
+        hint = f"give one value for all joints, or {joints}"
+        raise InputError(f"{name} has shape {np.shape(value)}", where="RealTime", hint=hint)
+    return np.broadcast_to(np.asarray(value, float), (joints,))

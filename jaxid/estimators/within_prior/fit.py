@@ -66,6 +66,7 @@ from jaxid.numerics.precision import (
     LAPLACE,
     POSTERIOR,
     Precision,
+    Rows,
     hessian_covariance,
     hessian_notes,
 )
@@ -135,21 +136,23 @@ def within_prior_steps(
     numerics = replace(chosen[0], substeps=max(each.substeps for each in chosen))
     problem = _problem(machine, parts, prior, on, numerics, widths)
     problem = replace(problem, minimiser=minimiser_of(minimiser))
-    if problem.logs and drawn and omits_quantisation(machine, problem):
+    quantised = omits_quantisation(machine, problem)
+    if problem.logs and drawn and quantised:
         raise InputError(
             "the quantisation of the readings is drawn for one log, and there are several",
             where="within_prior",
             hint='set drawn = false, or on = "position"',
         )
+
     given = [problem.prior.inward(problem.padded(t)) for t in others]
     first = None if begin is None else problem.prior.inward(problem.padded(begin))
     fit, precision, multistart = yield from _search(machine, problem, first, starts, given, drawn)
 
-    quantised = omits_quantisation(machine, problem)
     # Hessian and profiles are of the loop without quantisation.
     exact = precision is not None and not (drawn and quantised)
     notes = [
-        f"{fit.count} directions of {len(problem.places)} unknowns fitted, the others are left to the prior"
+        *notes_of(parts[0].machine, numerics, parts[0].log, on, minimiser),
+        f"{fit.count} directions of {len(problem.places)} unknowns fitted, the others are left to the prior",
     ]
     if precision is not None and exact and hessian:
         precision = yield from _with_full_hessian(fit, precision)
@@ -157,30 +160,33 @@ def within_prior_steps(
     if exact or precision is None:
         notes += hessian_notes(whole, hessian)
     details: dict[str, Any] = {"directions": stated}
+
     if exact and profile:
         notes += yield from add_profiles(fit, fit.problem.noise(fit.minimum, fit.count), stated)
     if exact and profile_of:
         details["profiles"], remarks = yield from profiles_of(machine, fit, whole, profile_of)
         notes += remarks
     if quantised:
-        more = [
-            name for name, asked in (("full Hessian", hessian), ("profiles", profile or profile_of)) if asked
-        ]
-        notes += _quantisation_notes(drawn, precision is not None, more)
+        asked = {"full Hessian": hessian, "profiles": profile or profile_of}
+        notes += _quantisation_notes(drawn, precision is not None, [name for name in asked if asked[name]])
 
     if problem.logs and precision is not None:
         logs = rows_of(fit)
         notes += disagreement(logs, fit.count)
-        entries = []
-        for fitted, rows in zip(logs, fit.problem.slices, strict=True):
-            entry: dict[str, Any] = {"samples": int(fitted.counts.sum())}
-            weights = fit.problem.weight[rows][0]
-            if np.sum(weights > 0) == 1:
-                entry["noise"] = float(fitted.equivalent_variance() ** 0.5 / weights.max())
-            entries.append(entry)
-        details |= by_log(parts, entries)
-    notes = (*notes_of(parts[0].machine, numerics, parts[0].log, on, minimiser), *notes)
-    return _estimate(machine, fit, whole, notes, details | multistart | kept_delay(machine, numerics))
+        details |= by_log(parts, _facts_by_log(fit, logs))
+    return _estimate(machine, fit, whole, tuple(notes), details | multistart | kept_delay(machine, numerics))
+
+
+def _facts_by_log(fit: SubspaceFit, logs: Sequence[Rows]) -> list[dict[str, Any]]:
+    """Return the number of samples of each log and, if one column counts, the noise of it."""
+    entries = []
+    for fitted, rows in zip(logs, fit.problem.slices, strict=True):
+        entry: dict[str, Any] = {"samples": int(fitted.counts.sum())}
+        weights = fit.problem.weight[rows][0]
+        if np.sum(weights > 0) == 1:
+            entry["noise"] = float(fitted.equivalent_variance() ** 0.5 / weights.max())
+        entries.append(entry)
+    return entries
 
 
 def _problem(
