@@ -39,7 +39,7 @@ _SLOWER = 0.1
 # Eigenvalues of the scaled normal matrix below this part of the largest are rounding.
 _ROUNDING = 1e-10
 # Standard deviations, as a part of the force, beyond which a combination is not identifiable.
-_UNTOLD = 0.5
+_UNIDENTIFIABLE = 0.5
 
 
 def open_steady(case: Case, log: LogLike, validate: Sequence[LogLike], read: Callable[..., Log]) -> Session:
@@ -266,9 +266,9 @@ def _precision(
             f"{freedom} rows to spare"
         )
     spread = np.sqrt(variance / np.maximum(values, 1e-300))
-    blind = blind | (spread > _UNTOLD * size)
-    seen = vectors[:, ~blind]
-    covariance = variance * (seen / values[~blind]) @ seen.T / np.outer(norm, norm)
+    blind = blind | (spread > _UNIDENTIFIABLE * size)
+    certain = vectors[:, ~blind]
+    covariance = variance * (certain / values[~blind]) @ certain.T / np.outer(norm, norm)
     identifiable = ~held(vectors[:, blind]) if p else np.zeros(0, bool)
     covariance[~identifiable] = np.nan
     covariance[:, ~identifiable] = np.nan

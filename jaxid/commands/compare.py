@@ -143,12 +143,12 @@ def _result(
     why: str,
 ) -> Comparison:
     final, values, std = search.estimate(model, search.round(start).screen.whitened)
-    told = dict(zip(final.unknowns, zip(values, std, strict=True), strict=True))
+    estimates = dict(zip(final.unknowns, zip(values, std, strict=True), strict=True))
     free, names = search.superset.machine.parameters.free, [log.name for log in search.logs]
 
     def value(index: int, log: int) -> Value:
-        unknown = next(u for u in told if u.index == index and log in u.logs)
-        return Value(float(told[unknown][0]), float(told[unknown][1]), free[index].unit)
+        unknown = next(u for u in estimates if u.index == index and log in u.logs)
+        return Value(float(estimates[unknown][0]), float(estimates[unknown][1]), free[index].unit)
 
     differences = []
     for found in named:
@@ -169,7 +169,7 @@ def _result(
         )
     shared = {
         free[u.index].name: Value(float(v), float(s), free[u.index].unit)
-        for u, (v, s) in told.items()
+        for u, (v, s) in estimates.items()
         if len(u.logs) == len(names)
     }
     screen = search.round(start).screen

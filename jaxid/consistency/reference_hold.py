@@ -132,7 +132,7 @@ def _compared(
 def reference_hold_finding(
     log: Log, compared: ReferenceHold, hold: str, unit: str, *, stated: bool
 ) -> list[Finding]:
-    """Return the note that another hold than the present one is used, fits better, or cannot be told.
+    """Return the note that another hold than the present one is used, fits better, or is not identifiable.
 
     Args:
         log: The log.

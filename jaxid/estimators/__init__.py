@@ -271,10 +271,10 @@ def _start(session: Session) -> Steps[np.ndarray | None]:
     first = yield from METHODS[method](session)
     elsewhere = [in_loop(path) for path, _ in parameters.places]
     within = np.isin(np.arange(len(first.theta)), [k for body in parameters.bodies for k in body.places])
-    told = first.converged and np.all(first.identifiable | elsewhere | within)
+    usable = first.converged and np.all(first.identifiable | elsewhere | within)
     lower, upper = parameters.bounds
     inside = np.all((first.theta >= lower) & (first.theta <= upper))
-    return first.theta if told and inside else None
+    return first.theta if usable and inside else None
 
 
 def _recursive(session: Session) -> Steps[Estimate]:

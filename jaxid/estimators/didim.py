@@ -114,14 +114,14 @@ class _Look(NamedTuple):
         return float(np.sqrt(np.sum(self.weights * np.square(self.size))))
 
     @property
-    def seen(self) -> list[np.ndarray]:
+    def on_regressor(self) -> list[np.ndarray]:
         """Slope projected on the span of the regressor, for which the formulas of least squares hold."""
         bases = [span(x[mask]) for x, mask in zip(self.regressor, self.rows, strict=True)]
         return projected(self.slope, bases, self.rows)
 
     def logs(self, held: bool) -> list[Rows]:
         """Return the residual of each log with the Jacobian that gives the precision."""
-        columns = self.seen if held else self.slope
+        columns = self.on_regressor if held else self.slope
         return [
             Rows(x, e, rows, size, float(weight))
             for x, e, rows, size, weight in zip(
@@ -240,7 +240,7 @@ def _search(
     message, step = f"no convergence within {_MOST_STEPS} steps", 0
     while step < _MOST_STEPS:
         step += 1
-        columns = look.seen if held else look.slope
+        columns = look.on_regressor if held else look.slope
         columns = look.regressor if held and step <= _ROUGH_STEPS else columns
         e, jacobian = look.residual, counted(columns, look.rows, weights)
         change = best_step(machine.parameters, jacobian, e, theta)

@@ -133,25 +133,25 @@ def instrumental_variable_steps(
         weights = start_weights([log.size for log in logs], [int(log.rows.sum()) for log in logs])
 
     fit = lambda theta, weights: _search(logs, machine.parameters, theta, weights)
-    sound = lambda found: found.seen if found.message == "converged" else None
+    sound = lambda found: found.on_instruments if found.message == "converged" else None
     found, _ = yield from weighted_steps(fit, sound, lambda found: found.theta, theta, weights)
 
-    guess, seen = machine.parameters.guess, found.seen
-    precision = assess_together(machine.parameters.names, seen, np.where(guess != 0, guess, 1.0))
+    guess, on_instruments = machine.parameters.guess, found.on_instruments
+    precision = assess_together(machine.parameters.names, on_instruments, np.where(guess != 0, guess, 1.0))
     looped, converged = all(log.rerun.looped for log in logs), found.message == "converged"
     how = "in its loop" if looped else "in open loop from the measured force"
     notes = [f"instruments: the regressor along the motion simulated {how}"]
-    details = by_log(parts, shares(seen)) if several else {}
+    details = by_log(parts, shares(on_instruments)) if several else {}
     # In open loop the instruments hold the noise of the force, which is in the residual too.
     if looped and found.bases is not None and converged:
-        columns = [replace(row, jacobian=x) for row, x in zip(seen, found.columns, strict=True)]
+        columns = [replace(row, jacobian=x) for row, x in zip(on_instruments, found.columns, strict=True)]
         jacobian, e, counts = stacked(columns)
         test = endogeneity(e, jacobian, np.asarray(scipy.linalg.block_diag(*found.bases)), counts)
         if test is not None:
             names = machine.parameters.names
             notes, details = [*notes, test.text(names)], details | {"durbin_wu_hausman": test.json(names)}
     if several:
-        notes += disagreement(seen, int(precision.identifiable.sum()))
+        notes += disagreement(on_instruments, int(precision.identifiable.sum()))
     return Estimate(
         method="instrumental_variable",
         machine=machine.with_estimate(found.theta),
@@ -159,8 +159,8 @@ def instrumental_variable_steps(
         precision=precision,
         converged=converged,
         message=found.message,
-        residual=np.concatenate([np.where(row.counts, row.residual, np.nan) for row in seen]),
-        samples=sum(int(row.counts.sum()) for row in seen),
+        residual=np.concatenate([np.where(row.counts, row.residual, np.nan) for row in on_instruments]),
+        samples=sum(int(row.counts.sum()) for row in on_instruments),
         steps=found.steps,
         notes=tuple(notes),
         details=details,
@@ -173,8 +173,8 @@ class _Found:
 
     Args:
         theta: Estimates of the unknowns, (p,).
-        seen: Residual of each log, with its Jacobian projected on the instruments. The formulas of least
-            squares then give the covariance.
+        on_instruments: Residual of each log, with its Jacobian projected on the instruments. The formulas of
+            least squares then give the covariance.
         columns: Jacobian of each log, (kept, n, p).
         bases: Orthonormal basis of the span of each log's instruments, (rows, r); None if a run failed.
         message: "converged", or the reason why the search stopped.
@@ -182,7 +182,7 @@ class _Found:
     """
 
     theta: np.ndarray
-    seen: list[Rows]
+    on_instruments: list[Rows]
     columns: list[np.ndarray]
     bases: list[np.ndarray] | None
     message: str
@@ -202,11 +202,11 @@ class _Found:
         """Return the result from residual and Jacobian of each log."""
         masks, columns = [log.rows for log in logs], [columns for _, columns in balance]
         inside = columns if bases is None else projected(columns, bases, masks)
-        seen = [
+        on_instruments = [
             Rows(x, e, log.rows, log.size, float(weight))
             for x, (e, _), log, weight in zip(inside, balance, logs, weights, strict=True)
         ]
-        return cls(theta, seen, columns, bases, message, steps)
+        return cls(theta, on_instruments, columns, bases, message, steps)
 
 
 def _search(

@@ -176,13 +176,13 @@ def _splits(machine: Machine, theta: np.ndarray, measured: tuple[bool, ...]) -> 
         for k, f in enumerate(machine.parameters.free)
         if f.path[0] == "effects" and f.path[2] == effects[_number(f)].sliding_level
     ]
-    seen = [k for k, port in levels if port < len(measured) and measured[port]]
+    visible = [k for k, port in levels if port < len(measured) and measured[port]]
     hidden = [k for k, port in levels if port < len(measured) and not measured[port]]
     out = []
-    for share in _SHARES if seen and hidden else ():
+    for share in _SHARES if visible and hidden else ():
         at = theta.copy()
-        total = at[seen].sum() + at[hidden].sum()
-        at[hidden], at[seen] = share * total / len(hidden), (1 - share) * total / len(seen)
+        total = at[visible].sum() + at[hidden].sum()
+        at[hidden], at[visible] = share * total / len(hidden), (1 - share) * total / len(visible)
         out.append(at)
     return out
 

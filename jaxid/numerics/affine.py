@@ -121,18 +121,18 @@ def depends(f: Callable, args: tuple) -> bool:
 
 def _follow(jaxpr: Jaxpr, entering: list[int]) -> list[int]:
     """Return how each output of a trace depends on the arguments."""
-    seen = dict(zip(jaxpr.invars, entering, strict=True))
+    known = dict(zip(jaxpr.invars, entering, strict=True))
 
     def of(variable: Any) -> int:
-        return _CONSTANT if isinstance(variable, Literal) else seen.get(variable, _CONSTANT)
+        return _CONSTANT if isinstance(variable, Literal) else known.get(variable, _CONSTANT)
 
     for step in jaxpr.eqns:
         kinds = [of(v) for v in step.invars]
         inner = step.params.get("jaxpr")
         if inner is not None and step.primitive.name in ("jit", "pjit"):
-            seen.update(zip(step.outvars, _follow(inner.jaxpr, kinds), strict=True))
+            known.update(zip(step.outvars, _follow(inner.jaxpr, kinds), strict=True))
         else:
-            seen.update(dict.fromkeys(step.outvars, _after(step, kinds)))
+            known.update(dict.fromkeys(step.outvars, _after(step, kinds)))
     return [of(v) for v in jaxpr.outvars]
 
 

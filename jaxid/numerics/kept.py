@@ -105,8 +105,8 @@ def _surroundings() -> bytes:
     root = Path(__file__).parents[1]
     files = sorted((str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in root.rglob("*.py"))
     versions = [version(name) for name in _KNOWN if name != "jaxid"]
-    told = (files, versions, platform.python_version(), os.environ.get("XLA_FLAGS"), jax.default_backend())
-    return repr((*told, _processor(), jax.device_count(), jax.config.read("jax_enable_x64"))).encode()
+    known = (files, versions, platform.python_version(), os.environ.get("XLA_FLAGS"), jax.default_backend())
+    return repr((*known, _processor(), jax.device_count(), jax.config.read("jax_enable_x64"))).encode()
 
 
 def _processor() -> tuple[str, ...]:

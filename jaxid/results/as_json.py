@@ -52,18 +52,18 @@ def parameters_json(
     )
     known_more = {"std_misspecified": estimate.std_misspecified} if incomplete else {}
     more = {key: std for key, std in known_more.items() if std is not None}
-    for k, (f, value, std, told) in enumerate(rows):
+    for k, (f, value, std, identifiable) in enumerate(rows):
         if names is not None and f.name not in names:
             continue
         if f.log is not None:
-            _add_of_log(out, f, value, std, told)
+            _add_of_log(out, f, value, std, identifiable)
             continue
         entry = {
-            "value": float(value) if told else None,
-            "std": float(std) if told else None,
+            "value": float(value) if identifiable else None,
+            "std": float(std) if identifiable else None,
             "unit": f.unit,
-            "identifiable": bool(told),
-            **{key: float(s[k]) if told and np.isfinite(s[k]) else None for key, s in more.items()},
+            "identifiable": bool(identifiable),
+            **{key: float(s[k]) if identifiable and np.isfinite(s[k]) else None for key, s in more.items()},
         }
         if f.index is None:
             out[f.name] = entry
@@ -77,16 +77,16 @@ def parameters_json(
     return out
 
 
-def _add_of_log(out: dict[str, Any], f: Free, value: float, std: float, told: bool) -> None:
+def _add_of_log(out: dict[str, Any], f: Free, value: float, std: float, identifiable: bool) -> None:
     """Add the value of an unknown in one log to its entry."""
     entry = out.setdefault(
         f.parameter, {"value": None, "std": None, "unit": f.unit, "identifiable": True, "by_log": {}}
     )
-    entry["identifiable"] = bool(entry["identifiable"] and told)
+    entry["identifiable"] = bool(entry["identifiable"] and identifiable)
     entry["by_log"][f.log] = {
-        "value": float(value) if told else None,
-        "std": float(std) if told else None,
-        "identifiable": bool(told),
+        "value": float(value) if identifiable else None,
+        "std": float(std) if identifiable else None,
+        "identifiable": bool(identifiable),
     }
 
 
@@ -98,8 +98,8 @@ def _key(f: Free) -> str:
 def _known(values: np.ndarray, unit: str) -> dict[str, Any]:
     """Return the entry of a plant's list before its unknown elements are filled in."""
     known = np.asarray(values, float)
-    std, told = np.full(known.shape, None), np.full(known.shape, True)
-    return {"value": known.tolist(), "std": std.tolist(), "unit": unit, "identifiable": told.tolist()}
+    std, identifiable = np.full(known.shape, None), np.full(known.shape, True)
+    return {"value": known.tolist(), "std": std.tolist(), "unit": unit, "identifiable": identifiable.tolist()}
 
 
 def one_or_list(x: np.ndarray | None) -> Any:

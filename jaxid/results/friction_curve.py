@@ -62,7 +62,7 @@ def _curve(machine: Machine, estimate: Estimate, view: LogView, incomplete: bool
     half = _half_width(machine, estimate, effects, grid, incomplete)
     some = thinned(len(view.velocity), _SAMPLES)
     at, left = view.velocity[some], view.residual_after
-    seen = None if left is None or not len(at) else left[some] + _friction(machine.plant, effects, at)
+    measured = None if left is None or not len(at) else left[some] + _friction(machine.plant, effects, at)
     return FrictionView(
         name=view.name,
         joint=view.joint,
@@ -70,8 +70,8 @@ def _curve(machine: Machine, estimate: Estimate, view: LogView, incomplete: bool
         force=force,
         low=None if half is None else force - half,
         high=None if half is None else force + half,
-        velocity_measured=None if seen is None else at,
-        force_measured=seen,
+        velocity_measured=None if measured is None else at,
+        force_measured=measured,
         units=view.units,
     )
 

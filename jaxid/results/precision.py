@@ -64,11 +64,11 @@ def precision_content(estimate: Estimate) -> dict[str, Any] | None:
     It has `words` on the covariance; `names` and `matrix` with all correlations of a few parameters, `pairs`
     with the strong ones of more; and the `profiles`.
     """
-    told = np.flatnonzero(estimate.identifiable)
-    if not told.size:
+    shown = np.flatnonzero(estimate.identifiable)
+    if not shown.size:
         return None
-    names = [estimate.names[k] for k in told]
-    matrix = estimate.precision.covariance[np.ix_(told, told)]
+    names = [estimate.names[k] for k in shown]
+    matrix = estimate.precision.covariance[np.ix_(shown, shown)]
     std = np.sqrt(np.diag(matrix))
     correlation = matrix / np.where(std > 0, np.outer(std, std), np.inf)
     pairs = [

@@ -111,8 +111,8 @@ def endogeneity(
     noise = left[:, kept]
     # In the orthonormal columns Q of P X and U the regressor is Q T + U S W'.
     q, singular, turned = np.linalg.svd(explained, full_matrices=False)
-    seen = singular > _ROUNDING * singular[0]
-    of_x = turned[seen].T @ (q[:, seen].T / singular[seen, None])
+    regular = singular > _ROUNDING * singular[0]
+    of_x = turned[regular].T @ (q[:, regular].T / singular[regular, None])
     of_noise = noise.T - (sizes[kept, None] * right[kept]) @ of_x
 
     gamma, rest = of_noise @ y, np.where(counts, e, 0.0)

@@ -70,13 +70,13 @@ def without_unseen_shapes(estimate: Estimate) -> Estimate:
     A shape that the log does not show ends anywhere. The standard deviation of the strength then holds for
     that value of the shape only.
     """
-    free, seen = estimate.machine.parameters.free, estimate.identifiable
-    if estimate.theta.size == 0 or seen.all():
+    free, identifiable = estimate.machine.parameters.free, estimate.identifiable
+    if estimate.theta.size == 0 or identifiable.all():
         return estimate
 
-    blind = shapes(estimate.machine) & ~seen
+    blind = shapes(estimate.machine) & ~identifiable
     unseen = {f.effect for f, b in zip(free, blind, strict=True) if b}
-    depends = np.asarray([ok and f.effect in unseen for f, ok in zip(free, seen, strict=True)])
+    depends = np.asarray([ok and f.effect in unseen for f, ok in zip(free, identifiable, strict=True)])
     if not depends.any():
         return estimate
 
@@ -87,7 +87,7 @@ def without_unseen_shapes(estimate: Estimate) -> Estimate:
     precision = replace(
         precision,
         covariance=covariance,
-        identifiable=seen & ~depends,
+        identifiable=identifiable & ~depends,
         unidentifiable=[*precision.unidentifiable, *({name: 1.0} for name in names)],
     )
     note = (

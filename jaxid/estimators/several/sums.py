@@ -66,7 +66,7 @@ def projected(
     """
     out = []
     for x, basis, mask in zip(values, bases, masks, strict=True):
-        seen = np.zeros_like(x)
-        seen[mask] = basis @ (basis.T @ x[mask])
-        out.append(seen)
+        inside = np.zeros_like(x)
+        inside[mask] = basis @ (basis.T @ x[mask])
+        out.append(inside)
     return out

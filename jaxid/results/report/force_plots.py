@@ -110,8 +110,8 @@ def draw_friction(ax: Axes, view: FrictionView, units: Mapping[str, str]) -> Non
         view: The friction.
         units: Labels of "force" and "velocity".
     """
-    seen = () if view.force_measured is None else (view.force_measured,)
-    factor, unit = scaled_unit(units["force"], [view.force, *seen])
+    measured = () if view.force_measured is None else (view.force_measured,)
+    factor, unit = scaled_unit(units["force"], [view.force, *measured])
     speed, speed_unit = scaled_unit(units["velocity"], [view.velocity])
     if view.velocity_measured is not None and view.force_measured is not None:
         x, y = view.velocity_measured / speed, drawable(view.force_measured) / factor

@@ -24,7 +24,7 @@ _OF_THE_ORDER = 0.5
 _DRIFTED = 0.1
 # Ratio of gap to noise beyond which the ratio says more than the colour.
 _CLEARLY = 1.3
-# A residual beyond this many times the measured force is told without a number.
+# A residual beyond this many times the measured force is stated without a number.
 _FAR = 10.0
 # A model that leaves this part of the force explains nothing: the log's columns are in doubt first.
 _NOTHING = 0.9
