@@ -275,11 +275,3 @@ def _precision(
     information = values / max(values[-1], 1e-300)
     precision = Precision(covariance, identifiable, named_directions(names, vectors[:, blind]), information)
     return precision, notes
-
-
-def without_noise(session: Session) -> Float[np.ndarray, " n"]:
-    """Return the RMS residual of a fit to the table of a session, for one whose scatter is not stated."""
-    from jaxid.numerics.lanes import run_alone
-
-    estimate = run_alone(steady_fit(session))
-    return np.sqrt(np.nanmean(estimate.residual**2, axis=0))

@@ -52,8 +52,6 @@ from jaxid.settings import (
 if TYPE_CHECKING:
     from jaxid.model.effect import Effect
 
-# Kinds of units that convert to the SI units of a machine.
-_MECHANICAL = ("length", "angle", "force", "torque")
 # Name of a case that is a dict, in messages and results.
 UNNAMED = "case"
 

@@ -102,8 +102,6 @@ _QUANTITIES: dict[str, tuple[tuple[str, ...], int]] = {
     "load_acceleration": (_OF_PLACE, 2),
     "force": (("force", "torque", "current", "voltage", "percent"), 0),
 }
-# Quantities that an encoder on the motor measures.
-_AT_MOTOR = ("position", "reference", "velocity", "acceleration")
 
 
 @dataclass(frozen=True)

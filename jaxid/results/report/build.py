@@ -27,7 +27,6 @@ from jaxid.results.report.data import (
     SearchStep,
     WherePlot,
 )
-from jaxid.results.report.page import render
 from jaxid.results.run_facts import run_facts
 
 if TYPE_CHECKING:
@@ -37,16 +36,6 @@ if TYPE_CHECKING:
     from jaxid.estimators.estimate import Estimate
     from jaxid.gap import Gap
     from jaxid.session import OpenedLog, Session
-
-
-def identification_report(result: Identification) -> str:
-    """Return the report of `identify` as one page of HTML."""
-    return render(identification_data(result))
-
-
-def discovery_report(result: Discovery) -> str:
-    """Return the report of `discover` as one page of HTML."""
-    return render(discovery_data(result))
 
 
 def identification_data(result: Identification) -> ReportData:

@@ -16,8 +16,9 @@ from jaxid.estimators.recursive.precision import precision_of
 from jaxid.estimators.recursive.recursion import Recursion, run
 from jaxid.estimators.recursive.rows import Rows
 from jaxid.logs.log import Log
-from jaxid.results.report.build import history_of, identification_report
+from jaxid.results.report.build import history_of, identification_data
 from jaxid.results.report.history_plots import plot_history
+from jaxid.results.report.page import render
 from jaxid.session import open_session
 from tests.estimators.recursive.test_recursion import gain_regression
 from tests.support.axis_log import log_of
@@ -269,5 +270,5 @@ def test_the_report_shows_how_it_went(axis):
     assert figure.axes[3].get_xlabel() == "time [s]"
     assert np.all(np.diff(view.time) > 0)
     np.testing.assert_allclose(view.std[-1], result.estimate.std, rtol=1e-9)
-    assert "How the estimate went" in identification_report(result)
+    assert "How the estimate went" in render(identification_data(result))
     assert history_of(estimate(*axis, "inverse_dynamics")) is None
