@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.discovery import every
+from benchmarks.stored_runs import commit_of
 from truth.hidden.bench import Case, write_files
 
 HERE = Path(__file__).parent
@@ -199,18 +200,6 @@ def line_of(row: Row) -> str:
         row.commit,
     )
     return f"| {' | '.join(map(str, cells))} |"
-
-
-def commit_of(root: Path) -> str:
-    """Name the commit of a working tree, with `-dirty` if more of it was changed than results."""
-
-    def git(*words: str) -> str:
-        return subprocess.run(
-            ["git", *words], capture_output=True, text=True, cwd=root, check=False
-        ).stdout.strip()
-
-    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!benchmarks/results")
-    return git("rev-parse", "--short=8", "HEAD") + ("-dirty" if changed else "")
 
 
 def origin() -> dict[str, str | int]:

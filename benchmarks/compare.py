@@ -8,7 +8,6 @@ Every pair of `truth/hidden/pairs.py` goes through `jaxid.compare`; a line of JS
 
 import argparse
 import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -17,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jaxid
+from benchmarks.stored_runs import append_runs, commit_of, read_runs
 from jaxid.logs.log import Log
 from truth.hidden.pairs import ALIKE, FIRST_SEED, Pair, pairs
 
@@ -37,16 +37,15 @@ def main() -> int:
     if lines.exists() and not options.resume:
         print(f"{lines} exists; give --resume to go on, or another -o", file=sys.stderr)
         return 2
-    done = {record["id"] for record in read(lines)}
+    done = {record["id"] for record in read_runs(lines)}
     end = time.monotonic() + 60.0 * options.minutes
     with tempfile.TemporaryDirectory() as folder:
         for pair in chosen:
             if pair.id not in done and time.monotonic() < end:
                 record = run(pair, Path(folder))
-                with lines.open("a") as file:
-                    file.write(json.dumps(record) + "\n")
+                append_runs(lines, [record])
                 print(_line(record), flush=True)
-    records = [r for r in read(lines) if r["id"] in {p.id for p in chosen}]
+    records = [r for r in read_runs(lines) if r["id"] in {p.id for p in chosen}]
     table = summary(records, options.split) | {"left": len(chosen) - len(records)}
     (Path(options.o) / "compare.json").write_text(json.dumps(table, indent=1) + "\n")
     (Path(options.o) / "compare.md").write_text(markdown(table, records))
@@ -66,12 +65,6 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--resume", action="store_true", help="skip the pairs that are done")
     parser.add_argument("-o", metavar="DIR", default=str(ROOT / "results" / "compare"))
     return parser.parse_args()
-
-
-def read(lines: Path) -> list[dict]:
-    """Return the records so far; a line that an interruption cut short is left out."""
-    text = lines.read_text() if lines.exists() else ""
-    return [json.loads(line) for line in text.split("\n")[:-1] if line.endswith("}")]
 
 
 def run(pair: Pair, folder: Path) -> dict:
@@ -147,10 +140,8 @@ def summary(records: Sequence[dict], split: str) -> dict:
         )
     visible, named = (sum(row[key] for row in rows) for key in ("visible", "named"))
     seconds = sorted(r["cpu_seconds"] for r in records if "cpu_seconds" in r)
-    git = ["git", "-C", str(ROOT)]
-    commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout
     return {
-        "split": split, "commit": commit.strip(), "date": time.strftime("%Y-%m-%d"),
+        "split": split, "commit": commit_of(ROOT), "date": time.strftime("%Y-%m-%d"),
         "differ": rows, "nulls": nulls, "visible": visible, "named": named,
         "median_cpu_seconds": seconds[len(seconds) // 2] if seconds else None,
         "aims_hold": named >= NAMED_AIM * visible and sum(n["false"] for n in nulls) <= FALSE_AIM,

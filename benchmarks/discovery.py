@@ -22,6 +22,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from benchmarks.discovery_table import aims_hold, markdown, summary
+from benchmarks.stored_runs import read_runs
 from truth.hidden import cases as hidden_cases
 from truth.hidden import chains as hidden_chains
 from truth.hidden.bench import Case
@@ -49,7 +50,7 @@ def main() -> int:
         return 2
     if options.oracle:
         ask_again(lines, {c.id: c for c in chosen})
-    done = {r["id"] for r in read(lines)}
+    done = {r["id"] for r in read_runs(lines)}
     if options.workers > 1:
         os.environ |= ONE_THREAD
     run([c for c in chosen if c.id not in done], lines, options.workers)
@@ -58,7 +59,7 @@ def main() -> int:
     ids = {c.id for c in chosen}
     cold = folder / "cold.json"
     table = summary(
-        [r for r in read(lines) if r["id"] in ids], json.loads(cold.read_text()) if cold.exists() else []
+        [r for r in read_runs(lines) if r["id"] in ids], json.loads(cold.read_text()) if cold.exists() else []
     )
     (folder / "discovery.json").write_text(json.dumps(table, indent=1))
     (folder / "discovery.md").write_text(markdown(table))
@@ -97,17 +98,11 @@ def _wanted(case: Case, options: argparse.Namespace) -> bool:
     )  # fmt: skip
 
 
-def read(lines: Path) -> list[dict]:
-    """Return the records so far; a line that an interruption cut short is left out."""
-    text = lines.read_text() if lines.exists() else ""
-    return [json.loads(line) for line in text.split("\n")[:-1] if line.endswith("}")]
-
-
 def ask_again(lines: Path, cases: dict[str, Case]) -> None:
     """Replace the oracle's evidence of cases that are done, after a change of the oracle."""
     from truth.hidden.bench import oracle
 
-    records = read(lines)
+    records = read_runs(lines)
     for record in tqdm(records, unit="case", desc="oracle"):
         if record["id"] in cases:
             record["oracle"] = oracle(cases[record["id"]])
@@ -127,13 +122,13 @@ def run(chosen: Sequence[Case], lines: Path, workers: int) -> None:
         workers, mp_context=multiprocessing.get_context("spawn"), max_tasks_per_child=1
     )
     with pool, tqdm(total=len(chosen), unit="case", desc="hidden cases") as bar:
-        before = len(read(lines))
+        before = len(read_runs(lines))
         left: set[Future] = {pool.submit(_work, group, str(lines)) for group in largest_first}
         while left:
             finished, left = wait(left, timeout=2.0, return_when="FIRST_COMPLETED")
             for future in finished:
                 future.result()
-            bar.update(len(read(lines)) - before - bar.n)
+            bar.update(len(read_runs(lines)) - before - bar.n)
 
 
 def _work(group: Sequence[Case], lines: str) -> None:

@@ -8,8 +8,6 @@ the table DIR/intervals.md from all of them.
 """
 
 import argparse
-import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,6 +20,7 @@ from scipy.stats import binom
 
 import jaxid
 from benchmarks.interval_machines import LOOPS, MACHINES, SENSORS
+from benchmarks.stored_runs import append_runs, commit_of, read_runs
 
 HERE = Path(__file__).parent / "results"
 CHUNK = 10
@@ -123,20 +122,15 @@ def main() -> int:
     options = parser.parse_args()
     options.o.mkdir(parents=True, exist_ok=True)
     stored = options.o / "intervals.jsonl"
-    lines = stored.read_text().splitlines() if stored.exists() else []
-    records = [json.loads(line) for line in lines if line.endswith("}")]
+    records, commit = read_runs(stored), commit_of(HERE.parents[1])
     done = {(r["cell"], r["asked"], r["seed"]) for r in records}
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=HERE.parent, check=False
-    ).stdout.strip()
 
     for method in options.method or [None]:
         for cell in options.cell or CELLS:
             missing = [s for s in range(options.runs) if (cell, method or "chosen", s) not in done]
             for at in range(0, len(missing), CHUNK):
                 new = run_chunk(cell, method, missing[at : at + CHUNK], commit)
-                with stored.open("a") as file:
-                    file.writelines(json.dumps(r) + "\n" for r in new)
+                append_runs(stored, new)
                 records += new
                 print(f"{cell} {method or 'chosen'}: {at + len(new)} of {len(missing)}", file=sys.stderr)
     text = table(records)

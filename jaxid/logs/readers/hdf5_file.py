@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,30 +26,22 @@ def read_hdf5(path: Path, names: list[str], rows: Rows | None) -> Table:
     field of a table follows the table's name, "log/q".
     """
     h5py = need("h5py", path, "HDF5")
-    try:
-        with h5py.File(path, "r") as file:
-            found = _datasets(file, h5py)
-            aliases = _aliases(found)
-            known: dict[str, Any] = dict.fromkeys(aliases)
-            units = {}
-            for name in names:
-                base = base_of(name, aliases)
-                same = [there for there in found if there.rpartition("/")[2] == base]
-                if base not in aliases and same:
-                    hint = f"write '{same[0]}'"
-                    raise InputError(f"has {len(same)} datasets '{base}'", where=str(path), hint=hint)
-                if base in aliases and known[base] is None:
-                    dataset, field = found[aliases[base]]
-                    need_size(8.0 * dataset.size, f"{path}, dataset '{base}'")
-                    known[base] = dataset[field] if field else dataset[()]
-                    units |= _unit_of(dataset, name)
-    except InputError:
-        raise
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-        if isinstance(error, OSError) and error.errno:
-            raise
-        what = f"cannot be read ({error or type(error).__name__})"
-        raise InputError(what, where=str(path), hint="is it an HDF5 file? export it again") from error
+    with _opened(path, h5py) as file:
+        found = _datasets(file, h5py)
+        aliases = _aliases(found)
+        known: dict[str, Any] = dict.fromkeys(aliases)
+        units = {}
+        for name in names:
+            base = base_of(name, aliases)
+            same = [there for there in found if there.rpartition("/")[2] == base]
+            if base not in aliases and same:
+                hint = f"write '{same[0]}'"
+                raise InputError(f"has {len(same)} datasets '{base}'", where=str(path), hint=hint)
+            if base in aliases and known[base] is None:
+                dataset, field = found[aliases[base]]
+                need_size(8.0 * dataset.size, f"{path}, dataset '{base}'")
+                known[base] = dataset[field] if field else dataset[()]
+                units |= _unit_of(dataset, name)
     columns, taken = pick_columns(path, known, names, rows)
     return Table(columns, taken, units)
 
@@ -60,15 +53,28 @@ def datasets_of(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
         InputError: If it is no HDF5 file.
     """
     h5py = need("h5py", path, "HDF5")
+    with _opened(path, h5py) as file:
+        found = _datasets(file, h5py)
+        kinds = {name: (d.dtype[field] if field else d.dtype).kind for name, (d, field) in found.items()}
+        return [
+            (name, d.shape, _unit_of(d, name).get(name, ""))
+            for name, (d, _) in found.items()
+            if kinds[name] in "fiu"
+        ]
+
+
+@contextmanager
+def _opened(path: Path, h5py: Any) -> Iterator[Any]:
+    """Open a file, and give one line for the exceptions with which h5py answers a damaged one.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
     try:
         with h5py.File(path, "r") as file:
-            found = _datasets(file, h5py)
-            kinds = {name: (d.dtype[field] if field else d.dtype).kind for name, (d, field) in found.items()}
-            return [
-                (name, d.shape, _unit_of(d, name).get(name, ""))
-                for name, (d, _) in found.items()
-                if kinds[name] in "fiu"
-            ]
+            yield file
+    except InputError:
+        raise
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         if isinstance(error, OSError) and error.errno:
             raise
