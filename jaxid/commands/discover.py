@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from jaxid.discovery.refit import in_simulation
 from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Search, Step
-from jaxid.discovery.separating.propose import proposals
+from jaxid.discovery.separating.propose import Proposal, proposals
 from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
@@ -49,6 +49,8 @@ from jaxid.simulation.solvers import SOLVERS
 _ABOVE_FLOOR = 1.3
 # Number of effects that hinder the simulation and are replaced; further ones are only removed.
 _BARRED = 3
+# Reason why no break-away friction is searched.
+_UNEXPLAINED = "there is a gap that no known effect explains"
 
 
 @named_faults()
@@ -136,16 +138,10 @@ def explore(
     if likely.added:
         machine, _ = final_machine(baseline.machine, search, {}, steps)
         refitted = begin(_with_effects, session, machine, refit)
-    alternatives = search.alternatives(steps)
     where = where_of(search, steps[0], session)
-    final, effects = final_machine(baseline.machine, search, alternatives, steps)
-    progress("simulating the effects")
-    while (c := hindering(search, session, final)) is not None:
-        # After some removals nothing is added in exchange, because a search must end.
-        steps += search.bar(c, WHY, max_effects if len(search.barred) < _BARRED else 0)
-        alternatives = search.alternatives(steps)
-        final, effects = final_machine(baseline.machine, search, alternatives, steps)
+    final, effects = _simulable(session, search, baseline.machine, steps, max_effects, progress)
     verdict = _verdict(effects, where, steps, search)
+
     progress("refitting in simulation" if refit else "simulating")
     before, old = declared.result()
     after, new = before, old
@@ -154,48 +150,113 @@ def explore(
         refitted = None
     if effects:
         after, new = refitted.result() if refitted else _with_effects(session, final, refit)
-    designs = session.machine.plant.designs_experiments if experiments is None else experiments
-    if session.more and experiments:
-        session.need_one_log("the design of experiments")
-    designs = designs and not session.more
-    separating = proposals(session, search, effects, progress) if designs else ()
-    simulated = after.machine
-    unseen = "there is a gap that no known effect explains" if verdict == "unexplained" else ""
-    # The trials of a start from rest run one machine.
-    differ = session.more and any(run.own and run.own.plant for run in session.fits)
-    differ = differ or any(f.log is not None for f in session.machine.parameters.free)
-    missing = [] if unseen or differ else _break_aways(search)
-    while missing:
-        progress("evaluating the starts from rest")
-        leaving = break_away(after, session.runs, [c.port for c in missing])
-        unseen = next((b for b in leaving if isinstance(b, str)), "")
-        held = [b for b in leaving if isinstance(b, BreakAway) and b.holds]
-        if not held or len(effects) >= max_effects:
-            break
-        # The clearest first: a joint that sticks makes its neighbours start late.
-        b = max(held, key=lambda b: b.evidence)
-        c = missing.pop(leaving.index(b))
-        where = where if effects else _at_starts(where, c, b)
-        after, found, step = _with_break_away(after, search, c, b)
-        steps.append(step)
-        effects, verdict = (*effects, found), "found"
-    if after.machine is not simulated:
+    separating = _experiments(session, search, effects, experiments, progress)
+
+    found = _Found(after, effects, where, _UNEXPLAINED if verdict == "unexplained" else "")
+    found = _with_break_aways(found, session, search, steps, max_effects, progress)
+    if found.estimate is not after:
         progress("simulating")
-        new = gaps(after.machine, session.runs)
+        verdict, new = "found", gaps(found.estimate.machine, session.runs)
     return Discovery(
         session,
         verdict,
-        None if verdict == "nothing_missing" else where,
-        effects,
+        None if verdict == "nothing_missing" else found.where,
+        found.effects,
         _as_refitted([_round(search, s) for s in steps], old, new, len(session.fits)),
         before,
-        after,
+        found.estimate,
         old,
         new,
         search.floor,
         separating,
-        unseen,
+        found.unseen,
     )
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Effects that were named so far.
+
+    Args:
+        estimate: Fit of the machine with them.
+        effects: The effects.
+        where: Region in which the baseline's residual is significant.
+        unseen: Reason why no break-away friction was named, or "".
+    """
+
+    estimate: Estimate
+    effects: tuple[NamedEffect, ...]
+    where: Where
+    unseen: str
+
+
+def _simulable(
+    session: Session,
+    search: Search,
+    machine: Machine,
+    steps: list[Step],
+    most: int,
+    progress: Callable[[str], None],
+) -> tuple[Machine, tuple[NamedEffect, ...]]:
+    """Replace or remove the effects that hinder the simulation; the steps of this are added to `steps`.
+
+    Returns:
+        The machine with the effects, and these.
+    """
+    alternatives = search.alternatives(steps)
+    final, effects = final_machine(machine, search, alternatives, steps)
+    progress("simulating the effects")
+    while (c := hindering(search, session, final)) is not None:
+        # After some removals nothing is added in exchange, because a search must end.
+        steps.extend(search.bar(c, WHY, most if len(search.barred) < _BARRED else 0))
+        alternatives = search.alternatives(steps)
+        final, effects = final_machine(machine, search, alternatives, steps)
+    return final, effects
+
+
+def _experiments(
+    session: Session,
+    search: Search,
+    effects: tuple[NamedEffect, ...],
+    asked: bool | None,
+    progress: Callable[[str], None],
+) -> tuple[Proposal, ...]:
+    """Design experiments that separate rival effects, where these are asked for, or the plant suits them."""
+    if session.more and asked:
+        session.need_one_log("the design of experiments")
+    designs = session.machine.plant.designs_experiments if asked is None else asked
+    return proposals(session, search, effects, progress) if designs and not session.more else ()
+
+
+def _with_break_aways(
+    found: _Found,
+    session: Session,
+    search: Search,
+    steps: list[Step],
+    most: int,
+    progress: Callable[[str], None],
+) -> _Found:
+    """Name the break-away friction that the starts from rest show; the steps of this are added to `steps`."""
+    # The trials of a start from rest run one machine.
+    differ = session.more and any(run.own and run.own.plant for run in session.fits)
+    differ = differ or any(f.log is not None for f in session.machine.parameters.free)
+    missing = [] if found.unseen or differ else _break_aways(search)
+    while missing:
+        progress("evaluating the starts from rest")
+        leaving = break_away(found.estimate, session.runs, [c.port for c in missing])
+        unseen = next((b for b in leaving if isinstance(b, str)), "")
+        found = replace(found, unseen=unseen)
+        held = [b for b in leaving if isinstance(b, BreakAway) and b.holds]
+        if not held or len(found.effects) >= most:
+            break
+        # The clearest first: a joint that sticks makes its neighbours start late.
+        b = max(held, key=lambda b: b.evidence)
+        c = missing.pop(leaving.index(b))
+        where = found.where if found.effects else _at_starts(found.where, c, b)
+        estimate, effect, step = _with_break_away(found.estimate, search, c, b)
+        steps.append(step)
+        found = _Found(estimate, (*found.effects, effect), where, unseen)
+    return found
 
 
 def _need_no_command_effects(session: Session) -> None:

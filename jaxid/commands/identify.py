@@ -110,23 +110,7 @@ def identify(
     """
     if method is not None:
         _check_method(method)
-    options: dict[str, Any] = {}
-    if solver is not None:
-        options["solver"] = _checked("solver", solver, tuple(SOLVERS), method)
-    if minimiser is not None:
-        _need_output_error("minimiser", minimiser_name(minimiser), method)
-        minimiser_of(minimiser)
-        options["minimiser"] = minimiser
-    if on is not None:
-        options["on"] = _checked("on", on, OUTPUTS, method)
-    if hessian is not None:
-        if method is not None:
-            refuse_without_likelihood("hessian", method)
-        options["hessian"] = hessian
-    if profile:
-        if method is not None:
-            refuse_without_likelihood("profile", method)
-        options["profile"] = (profile,) if isinstance(profile, str) else tuple(profile)
+    options = _checked_options(method, solver, minimiser, on, hessian, profile)
     case = load_case(case)
     session = open_session(case, log, validate, method=method, piecewise=_piecewise(case, method, options))
     need_names(options.get("profile", session.case.identification.profile), session.machine.parameters.names)
@@ -136,11 +120,13 @@ def identify(
             where=session.case.where,
             hint="give at least one parameter as { guess = ... }",
         )
+
     choice = None
     if method is None:
         asked = next((name for name in options if name not in ("hessian", "profile")), None)
         choice = choose_method(session, asked, curvature=bool(hessian or profile))
         method = choice.method
+
     progress(f"fitting by {method}")
     estimate = run_alone(_tested(method, session, options), _gaps_of(session))
     if choice is not None:
@@ -194,6 +180,39 @@ def identify_many(
         return with_choice((yield from _tested(choice.method, session, {})), choice)
 
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
+
+
+def _checked_options(
+    method: str | None,
+    solver: str | None,
+    minimiser: str | Minimiser | None,
+    on: str | None,
+    hessian: bool | None,
+    profile: Sequence[str],
+) -> dict[str, Any]:
+    """Return the options of `identify` that were given, by name.
+
+    Raises:
+        InputError: If one is unknown, or does not go with the method.
+    """
+    options: dict[str, Any] = {}
+    if solver is not None:
+        options["solver"] = _checked("solver", solver, tuple(SOLVERS), method)
+    if minimiser is not None:
+        _need_output_error("minimiser", minimiser_name(minimiser), method)
+        minimiser_of(minimiser)
+        options["minimiser"] = minimiser
+    if on is not None:
+        options["on"] = _checked("on", on, OUTPUTS, method)
+    if hessian is not None:
+        if method is not None:
+            refuse_without_likelihood("hessian", method)
+        options["hessian"] = hessian
+    if profile:
+        if method is not None:
+            refuse_without_likelihood("profile", method)
+        options["profile"] = (profile,) if isinstance(profile, str) else tuple(profile)
+    return options
 
 
 def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[Estimate]:
