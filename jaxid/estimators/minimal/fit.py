@@ -6,6 +6,7 @@ coefficients, a small weighted least-squares problem.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -70,54 +71,107 @@ def minimal_model_steps(
         Janot, Gautier, Jubien and Vandanjon, "Experimental joint stiffness identification depending on
         measurements availability".
     """
-    machine, log, stated = session.machine, session.fit.log, session.case.preprocess
-    where = session.case.where
+    plant, parameters = session.machine.plant, session.machine.parameters
     form = _form(session, printed)
-    model = _model(machine.plant, machine.parameters, form, session, where)
-    parameters, coefficients = machine.parameters, model.guess
-    theta = parameters.guess
-    now = natural_frequencies(machine.plant, parameters.places, theta).hz
+    model = _model(plant, parameters, form, session, session.case.where)
 
     # The band depends on the natural frequencies, and these on the estimate.
-    results = None
+    coefficients, theta, solved = model.guess, parameters.guess, None
+    now = natural_frequencies(plant, parameters.places, theta).hz
     for k in range(_PASSES):
         natural = now
-        spectrum = spectrum_of(
-            log, machine, model.structure, coefficients, model.known, natural, stated.median
-        )
-        recipe, notes = choose_filtering(log, stated, model.structure, spectrum)
-        balance = _linear_balance(machine.plant, parameters.places, theta)
-        data = regression_of(log, machine, model.structure, model.basis, model.known, recipe, balance)
-        _require_samples(data, model, log.source)
-        weights = _weights(form, model.structure.rows, natural, weight)
-        fit = least_squares(model.basis.names, data, weights)
-        options = (Transform.of(parameters), parameters.bounds)
-        minimum, chi, slopes = yield SolveRequest(
-            read_back,
-            (
-                machine.plant,
-                parameters.places,
-                model.structure,
-                model.maps,
-                fit.chi,
-                fit.root,
-                np.asarray(np.linalg.norm(fit.residual)),
-                parameters.guess,
-                *options,
-            ),
-        )
-        chi, slopes, theta = (np.asarray(a) for a in (chi, slopes, minimum.theta))
-        results = (data, fit, weights, (minimum, chi, slopes), recipe, notes)
-        coefficients = model.basis.constant + model.basis.spread @ chi
-        now = natural_frequencies(machine.plant, parameters.places, theta).hz
+        solved = yield from _solved_steps(session, model, coefficients, theta, natural, weight)
+        theta = solved.theta
+        coefficients = model.basis.constant + model.basis.spread @ solved.chi
+        now = natural_frequencies(plant, parameters.places, theta).hz
         moved = np.abs(now / natural - 1) if natural.size else np.zeros(1)
         # At the guesses the reversals of a hidden joint are not known: it needs a second pass.
-        if k >= bool(form.hidden) and (moved.max() < _SETTLED or stated.cutoff_hz is not None):
+        settled = moved.max() < _SETTLED or session.case.preprocess.cutoff_hz is not None
+        if k >= bool(form.hidden) and settled:
             break
-    assert results is not None, "there is at least one pass"
-    data, fit, weights, solved, recipe, notes = results
-    constraint = yield from constraint_steps(machine.plant, parameters, model, fit, theta, solved[2])
-    return _estimate(session, model, data, fit, weights, solved, constraint, recipe, notes)
+    assert solved is not None, "there is at least one pass"
+
+    constraint = yield from constraint_steps(plant, parameters, model, solved.fit, theta, solved.slopes)
+    return _estimate(session, model, solved, constraint)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Coefficients and parameters, fitted with one choice of the filters.
+
+    Args:
+        data: The regression of the coefficients.
+        weights: Weight of each of its rows, (rows,).
+        fit: The fit of the coefficients.
+        minimum: The fit of the parameters to them.
+        chi: Coefficients at the parameters, (k,).
+        slopes: Derivatives of these in the parameters, (k, p).
+        recipe: Filters of the log.
+        notes: Notes about the filters.
+    """
+
+    data: Regression
+    weights: np.ndarray
+    fit: MinimalFit
+    minimum: Minimum
+    chi: np.ndarray
+    slopes: np.ndarray
+    recipe: Recipe
+    notes: tuple[str, ...]
+
+    @property
+    def theta(self) -> np.ndarray:
+        """The parameters, (p,)."""
+        return np.asarray(self.minimum.theta)
+
+
+def _solved_steps(
+    session: Session,
+    model: Model,
+    coefficients: np.ndarray,
+    theta: np.ndarray,
+    natural: np.ndarray,
+    weight: float | None,
+) -> Steps[_Solved]:
+    """Filter the log, fit the coefficients, and fit the parameters to them.
+
+    Args:
+        session: Case and log.
+        model: The model.
+        coefficients: Coefficients by which the filters are chosen, (k,).
+        theta: Parameters at which reversals of hidden joints are found, (p,).
+        natural: Natural frequencies [Hz].
+        weight: Weight of the rows that were differentiated twice; None: as `minimal_model_steps` says.
+
+    Raises:
+        InputError: If too few samples remain.
+    """
+    machine, log, stated = session.machine, session.fit.log, session.case.preprocess
+    structure, basis, parameters = model.structure, model.basis, machine.parameters
+    spectrum = spectrum_of(log, machine, structure, coefficients, model.known, natural, stated.median)
+    recipe, notes = choose_filtering(log, stated, structure, spectrum)
+    balance = _linear_balance(machine.plant, parameters.places, theta)
+    data = regression_of(log, machine, structure, basis, model.known, recipe, balance)
+    _require_samples(data, model, log.source)
+
+    weights = _weights(structure.form, structure.rows, natural, weight)
+    fit = least_squares(basis.names, data, weights)
+    minimum, chi, slopes = yield SolveRequest(
+        read_back,
+        (
+            machine.plant,
+            parameters.places,
+            structure,
+            model.maps,
+            fit.chi,
+            fit.root,
+            np.asarray(np.linalg.norm(fit.residual)),
+            parameters.guess,
+            Transform.of(parameters),
+            parameters.bounds,
+        ),
+    )
+    return _Solved(data, weights, fit, minimum, np.asarray(chi), np.asarray(slopes), recipe, notes)
 
 
 def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Recipe, tuple[str, ...]]:
@@ -235,39 +289,23 @@ def _weights(form: Form, rows: int, natural: np.ndarray, weight: float | None) -
     return np.append(np.full(rows - 1, weight), 1.0)
 
 
-def _estimate(
-    session: Session,
-    model: Model,
-    data: Regression,
-    fit: MinimalFit,
-    weight: np.ndarray,
-    solved: tuple[Minimum, np.ndarray, np.ndarray],
-    constraint: Constraint | None,
-    recipe: Recipe,
-    notes: tuple[str, ...],
-) -> Estimate:
+def _estimate(session: Session, model: Model, solved: _Solved, constraint: Constraint | None) -> Estimate:
     """Build the estimate.
 
     Args:
         session: Case and log.
         model: The model that was fitted.
-        data: Its regression.
-        fit: The fit of its coefficients.
-        weight: Weight of each row, (rows,).
-        solved: The fit of the parameters, their chi, and its slopes in the parameters.
+        solved: Its coefficients and parameters.
         constraint: Test of the coefficients against those of a plant, if there is one.
-        recipe: Filters of the log.
-        notes: Notes about the filters.
     """
     machine, parameters = session.machine, session.machine.parameters
-    minimum, chi, slopes = solved
-    theta = np.asarray(minimum.theta)
+    data, fit, minimum, theta = solved.data, solved.fit, solved.minimum, solved.theta
 
     # The residual of the model at the parameters, not at the free coefficients.
-    w = np.where(data.counts[..., None], data.w * weight[:, None], 0.0)
-    residual = fit.residual + w @ (fit.chi - chi)
+    w = np.where(data.counts[..., None], data.w * solved.weights[:, None], 0.0)
+    residual = fit.residual + w @ (fit.chi - solved.chi)
     precision = assess(
-        parameters.names, w @ slopes, residual, data.counts, fit.size, np.where(theta != 0, theta, 1.0)
+        parameters.names, w @ solved.slopes, residual, data.counts, fit.size, np.where(theta != 0, theta, 1.0)
     )
 
     converged = bool(minimum.converged) and bool(np.all(np.isfinite(theta)))
@@ -286,8 +324,8 @@ def _estimate(
         residual=np.where(data.counts, residual, np.nan),
         samples=int(data.counts.any(axis=1).sum()),
         steps=int(minimum.steps),
-        notes=(*notes, *minimal_notes(form, fit, model.basis, constraint), *pressed),
-        details={"minimal": minimal_json(form, fit, model.basis, constraint, modes, recipe)},
+        notes=(*solved.notes, *minimal_notes(form, fit, model.basis, constraint), *pressed),
+        details={"minimal": minimal_json(form, fit, model.basis, constraint, modes, solved.recipe)},
     )
 
 
