@@ -18,7 +18,7 @@ from jaxid.first_case.columns import Chosen, choose, columns_of
 from jaxid.first_case.drafting import Draft
 from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_arm, of_tree
 from jaxid.first_case.raw import raw_log
-from jaxid.first_case.section import case_text
+from jaxid.first_case.section import Section, case_text
 from jaxid.first_case.units import measures_of
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
@@ -131,6 +131,7 @@ def init(
     if isinstance(log, Log):
         hint = "give the file, or a table with the columns by name"
         raise InputError("a Log has its columns already", where=log.source, hint=hint)
+
     raw = raw_log(log)
     robot = _robot(mjcf, urdf if tree else None)
     names = () if robot is None else tuple(joint.name for joint in robot.free)
@@ -143,6 +144,7 @@ def init(
     elif len(chosen.joints) > 1:
         need_forces(chosen, raw.source)
         chosen = most_moved(chosen)
+
     motion = "" if robot is None else _motion_of(robot, next(iter(chosen.joints)))
     draft = Draft(log, raw, chosen, measures_of(chosen, motion), Path(folder))
     if robot is not None:
@@ -156,16 +158,21 @@ def init(
         sections = draft.arm(arm, Path(urdf), tip)
     else:
         sections = draft.axis()
-    title = [f"Case of {Path(raw.source).name}, written by `jaxid init`.", *_TITLE]
-    first = FirstCase(
+    first = _first_case(raw.source, Path(folder), sections)
+    _need_loadable(first, chosen)
+    return first
+
+
+def _first_case(source: str, folder: Path, sections: Sequence[Section]) -> FirstCase:
+    """Join the sections of a case, with what they assume and ask."""
+    title = [f"Case of {Path(source).name}, written by `jaxid init`.", *_TITLE]
+    return FirstCase(
         case_text(title, sections),
-        Path(folder),
-        raw.source,
+        folder,
+        source,
         tuple(line for section in sections for line in section.assumed),
         tuple(line for section in sections for line in section.questions),
     )
-    _need_loadable(first, chosen)
-    return first
 
 
 def _robot(mjcf: str | Path | None, urdf: str | Path | None) -> Robot | None:
