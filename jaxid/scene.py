@@ -229,7 +229,7 @@ def _by_drive(signal: np.ndarray, machine: Machine) -> np.ndarray:
 
 
 def _drive(case: Case, machine: Machine, period: float, longer: float) -> Drive:
-    """Exact sticking, unless the case states a sharpness: then friction is smoothed."""
+    """Return the integration of a log: friction sticks exactly, unless the case states a sharpness."""
     delayed = any(e.delays_command() for e in machine.plant.effects)
     delays = machine.plant.command_delays(machine.gain.size)
     longest = int(np.ceil(longer * float(delays.max()) / period)) + 1 if delayed else 0

@@ -69,7 +69,7 @@ def need_mujoco(file: str, purpose: str = "reading an MJCF file") -> Any:
 
     Args:
         file: The file, for messages.
-        purpose: What needs it, for messages.
+        purpose: Feature that needs it, for messages.
 
     Raises:
         InputError: If it is not installed.

@@ -36,7 +36,7 @@ def better_hold(
     Args:
         machine: The machine.
         log: The log.
-        data: The same log, prepared under its hold.
+        data: The log, prepared under its hold.
         fit: Balance of the prepared log.
 
     Returns:

@@ -56,7 +56,7 @@ def estimated_force_noise(
     Args:
         machine: The machine at its guesses.
         log: The log.
-        data: The same log, prepared.
+        data: The prepared log.
         fit: Balance of the prepared log.
         law: Command of the declared control law at the logged readings, in units of the command; None: there
             is none that reproduces the logged one.
@@ -163,7 +163,7 @@ def noise_findings(
     Args:
         machine: The machine with its stated sensor.
         log: The log.
-        data: The same log, prepared.
+        data: The prepared log.
         fit: Balance of the prepared log.
         estimate: Result of `estimated_force_noise`.
     """

@@ -62,7 +62,7 @@ def compare_reference_holds(
     Args:
         machine: The machine with its controller.
         log: The log.
-        data: The same log, prepared.
+        data: The prepared log.
         fit: Balance of the prepared log.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Whether the logged force drives the motion, or brakes it: a wrong sign, column or unit."""
+"""Sign of the logged force: if it brakes the motion, its sign, column or unit is wrong."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def sign_findings(
     Args:
         machine: The machine at its guesses.
         log: The log, for its columns.
-        data: The same log, prepared.
+        data: The prepared log.
         declared: Balance of the log with the declared signs.
         gain: Declared gain of each drive, for the hint; None: the log is one of motors behind gears.
 

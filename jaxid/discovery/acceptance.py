@@ -227,7 +227,7 @@ def absorbed_noise(
     too, and would gain by it without explaining anything.
 
     Args:
-        domain: Where residuals are compared.
+        domain: Domain in which residuals are compared.
         samples: Samples of the log.
         colour: Noise expected from the sensors, by joint.
         old, new: All unknowns of the two models.

@@ -255,7 +255,7 @@ class CandidateSamples:
 
 
 class _Point(NamedTuple):
-    """What is known at one point of a superset: residual and Jacobian by the unknowns that it has columns of.
+    """Evaluations at one point of a superset: residual and Jacobian, by the unknowns of its columns.
 
     The superset is kept, so that no other one gets its identity.
     """

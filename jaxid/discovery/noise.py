@@ -37,7 +37,7 @@ def sensor_colour(
     Args:
         machine: The machine; its parameters enter through the impedance only.
         log: The log before preparation.
-        data: The same log, prepared.
+        data: The prepared log.
         force_noise: Standard deviation of the logged force in its units, (m,), if the case states none; None:
             that of its high band.
     """

@@ -12,7 +12,7 @@ class Finding:
         severity: "error" stops the work, "warning" is reported only.
         what: The fault, with its size and unit.
         where: File and quantity in which it is.
-        hint: What the user can do about it.
+        hint: Remedy for the user.
         about: "time", "units" or "wrap" for a doubt on how the log was read; empty: on its content.
     """
 

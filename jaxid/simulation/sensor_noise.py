@@ -50,7 +50,7 @@ def position_density(
     Args:
         machine: The machine; its parameters enter through the impedance only.
         log: The log before preparation.
-        data: The same log, prepared.
+        data: The prepared log.
 
     Returns:
         Frequencies up to half the log's sampling rate [Hz], and the density at these.
@@ -87,7 +87,7 @@ def noise_density(
     Args:
         machine: The machine; its parameters enter through the impedance only.
         log: The log before preparation.
-        data: The same log, prepared.
+        data: The prepared log.
         force_std: Standard deviation of the logged force if the case states none, in place of the estimated
             one, (m,).
 

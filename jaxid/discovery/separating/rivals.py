@@ -117,7 +117,7 @@ def _reduced(superset: cand.CandidateModel, keep: list[cand.Candidate]) -> tuple
 
 
 class Experiment(eqx.Module):
-    """How an experiment runs, in the loop or with the drive alone, and how its log is evaluated.
+    """An experiment in the loop or with the drive alone, and the evaluation of its log.
 
     Args:
         drive: Gain, hold and integration of the command.

@@ -66,7 +66,7 @@ class Stretch:
         Args:
             machine: The machine whose unknowns are estimated.
             log: The log.
-            data: The same log, filtered.
+            data: The filtered log.
             window: Start and end [s]; None: the whole log.
 
         Raises:
@@ -138,7 +138,7 @@ def least_squares_steps(machine: Machine, log: Log, data: Prepared, window: Wind
     Args:
         machine: The machine whose unknowns are estimated.
         log: The log.
-        data: The same log, filtered.
+        data: The filtered log.
         window: Start and end [s]; None: the whole log.
     """
     cut = Stretch.of(machine, log, data, window)

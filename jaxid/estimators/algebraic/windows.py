@@ -209,7 +209,7 @@ def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
     Args:
         machine: The machine whose unknowns are estimated.
         log: The log, whose measured positions are integrated without a filter.
-        data: The same log, filtered: its velocity is used for forces that are nonlinear in it.
+        data: The filtered log: its velocity is used for forces that are nonlinear in it.
 
     Returns:
         The estimate. Windows in which the axis rests for more than a twentieth of the time are omitted: the

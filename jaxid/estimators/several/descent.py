@@ -25,7 +25,7 @@ class Model(NamedTuple):
         cost: The cost.
         gradient: Its gradient, (q,).
         normal: Positive semidefinite part of its second derivative, (q, q).
-        content: What the cost was computed from.
+        content: Terms from which the cost was computed.
     """
 
     cost: float

@@ -223,7 +223,7 @@ class ChainPart:
 
 
 def si_units() -> dict[str, str]:
-    """Units of a linear axis; the default of a report."""
+    """Return the units of a linear axis, the default of a report."""
     return {"position": "m", "velocity": "m/s", "force": "N", "time": "s"}
 
 
@@ -259,7 +259,7 @@ class ReportData:
         history: History of a recursive estimate; None for any other.
         precision: Content of the section on precision, see `jaxid.results.precision.precision_content`; None
             without parameters.
-        findings: What to know about the result, in sentences, the most important first.
+        findings: Sentences about the result, the most important first.
         model_complete: Whether the model leaves nothing but noise; None if that is not known.
         explains: Whether the model explains the log at all.
         identified: Whether the log determines at least one parameter.
