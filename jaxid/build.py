@@ -218,10 +218,12 @@ def _bare_plant(case: Case, at_truth: bool) -> tuple[Plant, list[Free]]:
         for name, value in known.items()
         if value is not None and name in entry.cls.__dataclass_fields__
     }
+
     values: dict[str, Any] = {}
     for name, given in entry.parameters.items():
         values[name] = _guesses(given, at_truth) if isinstance(given, tuple) else given.start(at_truth)
     plant = entry.cls(**values, **options, **entry.options)
+
     free: list[Free] = []
     for name, info in parameters_of(entry.cls).items():
         given = entry.parameters.get(name)
@@ -363,6 +365,7 @@ def _controller(
     values |= {name: at_start(value, at_truth) for name, value in case.controller.unknown.items()}
     static = {field.name for field in fields(cls) if field.metadata.get("static")}
     arrays: dict[str, Any] = {k: v if k in static else as_array(v) for k, v in values.items()}
+
     period = case.controller.period or _log_period(case, period)
     plant, where = case.plant, f"{case.where}, [controller]"
     check_drives(case.controller.kind, plant.cls, plant.drives, plant.joints, where)
@@ -374,6 +377,7 @@ def _controller(
             known = Machine(model, Parameters(tuple(free)), gain, plant.units)
             settings = Recursive(**{k: arrays.pop(k) for k in ON_LINE if k in arrays})
             arrays["estimator"] = _estimator(case, known, period, settings)
+
     own = case.log is not None and case.log.loop_velocity is not None
     return cls(period=period, own_velocity=own, **arrays)
 

@@ -110,6 +110,7 @@ class Scene:
                 where=f"{where}, [log]",
                 hint="leave it out of the case that is simulated",
             )
+
         rate, duration = sampling_of(case)
         machine = build_machine(case, at_truth=True, period=1 / rate)
         joints = case.plant.joints
@@ -117,6 +118,7 @@ class Scene:
         velocity = np.broadcast_to(np.asarray(setting.initial_velocity), joints)
         refuse_impossible(machine.plant, position[None], f"{where}, [simulation] initial_position")
         _refuse_massless(machine.plant, position, where)
+
         if machine.controller is None:
             if not case.input:
                 raise InputError(
@@ -129,6 +131,7 @@ class Scene:
             )
             drive = _drive(case, machine, 1 / rate, longer_delays)
             return cls(case, machine, drive, _by_drive(command, machine), position, velocity)
+
         if not case.reference:
             raise InputError("there is nothing to follow", where=where, hint="add a [reference]")
         period = machine.controller.period
@@ -146,6 +149,7 @@ class Scene:
         machine = _scaled(machine, reference, period)
         drive = _drive(case, machine, period, longer_delays)
         _refuse_coarse(case, machine, drive, reference, position)
+
         every = max(1, round(1 / (rate * period)))
         if abs(1 / (rate * period * every) - 1) > 1e-3:
             raise InputError(
@@ -170,6 +174,7 @@ class Scene:
         columns += 0 if inertial is None else inertial.count
         noise = rng.standard_normal((len(self.signal), columns))
         times = self.drive.period * np.arange(len(self.signal))
+
         start, sensor = (self.position, self.velocity), (machine.sensor, noise)
         looped = machine.controller is not None
         signal = self.signal
@@ -182,6 +187,7 @@ class Scene:
         else:
             sensor = (machine.sensor, noise[:, :joints])
             run = yield SolveRequest(_open_run, (machine.plant, self.drive, self.signal, *start, *sensor))
+
         _refuse_ended(machine.plant, run, self.drive.period, self.case.where)
         pick = slice(None, None, self.every)
         reference = signal[pick] if looped else None

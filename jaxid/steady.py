@@ -168,17 +168,20 @@ def steady_fit(session: Session) -> Steps[Estimate]:
     plant = sharpened(machine.plant, data)
     transform, damping = linear_scale(machine)
     options = (transform, machine.parameters.bounds, damping)
+
     fits: list[Minimum] = []
     theta = machine.parameters.guess
     for at in [theta, *shape_starts(machine, theta)]:
         fit, _ = yield SolveRequest(solve_balance, (plant, machine.parameters.places, arrays, at, *options))
         fits.append(fit)
     fit = min(fits, key=lambda f: np.nan_to_num(float(f.cost), nan=np.inf))
+
     values = np.asarray(fit.theta)
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     size = float(np.linalg.norm((weight * data.force)[rows]))
     precision, notes = _precision(machine, values, e, jacobian, rows, size, stated=stated)
+
     converged = bool(fit.converged) and bool(np.all(np.isfinite(values)))
     return Estimate(
         method="inverse_dynamics",
@@ -251,6 +254,7 @@ def _precision(
     shapes = np.where(dead, 0.0, flat / norm)
     values, vectors = np.linalg.eigh(shapes.T @ shapes)
     blind = values < _ROUNDING * max(values[-1], 1e-300)
+
     freedom = max(int(rows.sum()) - int((~blind).sum()), 1)
     variance = float(np.sum(e[rows] ** 2)) / freedom
     notes = []
@@ -265,6 +269,7 @@ def _precision(
             f"the residual {beyond} gives the standard deviations, {few:.2f} times as large for "
             f"{freedom} rows to spare"
         )
+
     spread = np.sqrt(variance / np.maximum(values, 1e-300))
     blind = blind | (spread > _UNIDENTIFIABLE * size)
     certain = vectors[:, ~blind]

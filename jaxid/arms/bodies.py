@@ -92,6 +92,7 @@ def bodies_of(
     own = np.zeros(plant.joints) if plant.rotor_inertia is None else np.asarray(plant.rotor_inertia)
     if are_bodies(found):
         return Bodies(found, own, 0.0)
+
     sums = _sums_of(plant)
     columns = [k for k, (name, _) in enumerate(sums.standard) if name in TEN]
     turning = [k for k, (name, _) in enumerate(sums.standard) if name not in TEN]
@@ -101,6 +102,7 @@ def bodies_of(
     kinds = np.array([TEN.index(sums.standard[c][0]) for c in columns])
     links = np.array([sums.standard[c][1] for c in columns])
     wanted = mapping @ found[links, kinds] + sums.mapping[:, turning] @ (own - final)[: len(turning)]
+
     # A row counts by the size of its sum over the magnitudes of the file's bodies; one that is next to
     # nothing, such as the product of inertia of a symmetric link, by a part of the largest of its kind.
     size = np.abs(mapping) @ np.abs(start[links, kinds]) + np.abs(wanted)
@@ -109,6 +111,7 @@ def bodies_of(
     size = np.maximum(size, _SMALL * largest)
     heavy = np.flatnonzero(start[:, 0] > 0)
     asked = _Asked(*map(jnp.asarray, (start, heavy, mapping, links, kinds, wanted, size)))
+
     x = np.asarray(jax.vmap(log_cholesky)(jnp.asarray(_fuller(start[heavy])))).ravel()
     error = np.asarray(_rest(x, asked))
     for _ in range(_STEPS):
@@ -121,6 +124,7 @@ def bodies_of(
         if better is None:
             break
         x, error = x + better[0], better[1]
+
     out = np.asarray(_links(jnp.asarray(x), asked)).copy()
     return Bodies(out, final, float(np.abs(error).max()))
 

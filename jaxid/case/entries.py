@@ -130,10 +130,12 @@ def _linked(
             raise spot.at(of_file[0]).fault("goes with urdf only", 'add urdf = "<its file>", or leave it out')
         check_links(table, spot)
         parameters, geometry = read_links(table["links"], cls, spot, kinds)
+
     options = {name: given[name] for name in ("gravity_vector",) if name in given}
     if "shafts" in table:
         options["shafts"] = read_shafts(table["shafts"], geometry, spot)
     units = Units(given.get("motion", cls.usual_motion), **given.get("units", {}))
+
     return PlantEntry(
         cls=cls,
         parameters=parameters,

@@ -158,6 +158,7 @@ def _joints(mujoco: Any, model: Any, names: list[str], notes: list[str]) -> list
             anchor[:3, 3] = -model.jnt_pos[k]
             carrier, frame = len(out) - 1, turn.T @ anchor
         carriers.append((carrier, frame))
+
         if carrier >= 0 and model.body_mass[b] > 0:
             inertial = frame @ _place(mujoco, model.body_ipos[b], model.body_iquat[b])
             xx, yy, zz = model.body_inertia[b]
@@ -330,6 +331,7 @@ def _law(
             lost.append(f"{title} is more than a winding without inductance, driven by a voltage: not kept")
             return None
         return gear * constant / resistance, None, None, gear**2 * constant**2 / resistance
+
     biastype = model.actuator_biastype[k]
     if not is_one_of(model.actuator_gaintype[k], gains.mjGAIN_FIXED) or not is_one_of(
         biastype, biases.mjBIAS_NONE, biases.mjBIAS_AFFINE
@@ -342,6 +344,7 @@ def _law(
         offset, slope, rate = 0.0, 0.0, 0.0
     if offset:
         lost.append(f"{title} has a constant force of {offset:g}: it is not kept")
+
     if slope == 0.0:
         # A velocity servo is a gain on the wanted velocity, and drag.
         return gear * own, None, None, -(gear**2) * rate

@@ -215,6 +215,7 @@ def controller_keys(kind: str, kinds: Kinds) -> Keys:
         ),
         "disturbance": _DISTURBANCE,
     }
+
     cls = kinds.laws[kind]
     if cls.sees_error:
         keys["dead_band"] = Key(
@@ -233,6 +234,7 @@ def controller_keys(kind: str, kinds: Kinds) -> Keys:
                 known = number("nonnegative") if f.name == "derivative_filter" else number()
                 read = by_drive(_maybe_unknown(known, kind, f.name))
             law[f.name] = Key(read, f"{doc}; it belongs to kind = '{kind}'", required)
+
     if "estimator" in cls.of_machine:
         law |= {name: entry for name, entry in keys_of(Recursive).items() if name in ON_LINE}
     return {"kind": Key(anything), **law, **keys}

@@ -78,6 +78,7 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
     joints = [_joint(name, joint, links, file) for name, joint in _named(robot, "joint", file)]
     root = _root(links, joints, file)
     moving = _chain(root, links, joints, tip, file)
+
     names, places, bodies, carriers = [], [], [np.zeros(10)], [root]
     weighed = [False]
     # Links that remain to be visited, each with the body that contains it, and its frame in the body's.
@@ -100,12 +101,14 @@ def read_urdf(path: str | Path, tip: str | None = None) -> Urdf:
             carriers.append(joint.child)
             weighed.append(False)
             ahead.append((joint.child, len(names), turn.T))
+
     for k, (body, carrier) in enumerate(zip(bodies, carriers, strict=True)):
         if k and not body[0] > 0:
             what = "has no mass" if weighed[k] else "has no <inertial>"
             hint = "give it, or a link fixed to it, <inertial> with <mass> and <inertia>"
             where = f"{file}, link '{carrier}'"
             raise InputError(f"{what}, and joint '{names[k - 1]}' moves it", where=where, hint=hint)
+
     geometry = JointFrames(
         tuple(m for m, _ in places),
         np.array([p[:3, :3] for _, p in places]),
@@ -277,6 +280,7 @@ def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _
     kind = joint.get("type", "")
     if kind not in _TYPES:
         raise InputError(f"type '{kind}' is none of an arm's joints", where=where, hint=suggest(kind, _TYPES))
+
     ends = []
     for end in ("parent", "child"):
         element = joint.find(end)
@@ -285,11 +289,13 @@ def _joint(name: str, joint: Element, links: dict[str, Element], file: str) -> _
             what = f"<{end}> names no link" if not link else f"there is no link '{link}', its {end}"
             raise InputError(what, where=where, hint=suggest(link, links))
         ends.append(link)
+
     given = joint.find("axis")
     axis = np.array([1.0, 0.0, 0.0]) if given is None else _numbers(given, "xyz", 3, where)
     length = np.linalg.norm(axis)
     if _TYPES[kind] and not length > 0:
         raise InputError("<axis> has no length", where=where, hint='write a direction such as xyz="0 0 1"')
+
     copied = joint.find("mimic")
     parent, child = ends
     return _Joint(
@@ -320,6 +326,7 @@ def _root(links: dict[str, Element], joints: list[_Joint], file: str) -> str:
             where = f"{file}, link '{joint.child}'"
             raise InputError(f"{both}: the chain closes to a loop", where=where, hint=hint)
         into[joint.child] = joint.name
+
     roots = [name for name in links if name not in into]
     if len(roots) > 1:
         raise InputError(
@@ -327,6 +334,7 @@ def _root(links: dict[str, Element], joints: list[_Joint], file: str) -> str:
             where=file,
             hint="join them, or take out links that are not part of the arm",
         )
+
     reached, ahead = set(), list(roots)
     while ahead:
         link = ahead.pop()
@@ -350,6 +358,7 @@ def _chain(
     of_child = {j.child: j for j in joints}
     if tip is not None and tip not in links:
         raise InputError(f"there is no link '{tip}', the tip", where=file, hint=suggest(tip, links))
+
     ways = []
     for end in [tip] if tip is not None else links:
         way, link = [], end
@@ -357,6 +366,7 @@ def _chain(
             way.append(of_child[link])
             link = of_child[link].parent
         ways.append([j for j in reversed(way) if j.motion])
+
     longest = max(ways, key=len)
     for way in ways:
         for one, other in zip(way, longest, strict=False):
@@ -370,6 +380,7 @@ def _chain(
             where=file,
             hint="give it a revolute, continuous or prismatic one, or name another tip",
         )
+
     for joint in longest:
         if joint.mimics is not None:
             what = f"it copies joint '{joint.mimics}' (<mimic>), and would not be free"

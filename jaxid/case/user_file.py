@@ -114,11 +114,13 @@ def _import(path: Path, kind: str, spot: Spot) -> ModuleType:
     changed = path.stat().st_mtime_ns
     if path in _LOADED and _LOADED[path][0] == changed:
         return _LOADED[path][1]
+
     name = f"{USERS}{path.stem}_{zlib.crc32(str(path).encode()):08x}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None, "the path ends in .py"
     assert spec.loader is not None, "the path is a file's"
     module = importlib.util.module_from_spec(spec)
+
     effects, plants = dict(EFFECTS), dict(PLANTS)
     sys.modules[name] = module
     # A command that refuses a file leaves nothing beside it.

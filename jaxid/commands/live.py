@@ -63,11 +63,13 @@ class Live:
         law = scene.machine.law
         if law is None:
             raise InputError("there is no loop", where=case.where, hint="add a [controller]")
+
         self.machine = build_machine(case, period=scene.drive.period)
         self.reference: Float[np.ndarray, "ticks m"] = scene.signal
         self.period: float = scene.drive.period
         self.online_estimate: OnlineEstimate | None = None
         self.switched: int | None = None
+
         self._controller = law
         path = self._controller.path(jnp.asarray(self.reference))
         self._path = jax.tree.map(np.asarray, path)
@@ -81,6 +83,7 @@ class Live:
         self._last: np.ndarray | None = None
         self._as_given = np.full(self.machine.gain.size, np.nan)
         self._online, self._rows = None, None
+
         if identify:
             if "model" not in self._controller.of_machine or self.adapts:
                 kind = "" if case.controller is None else case.controller.kind
@@ -117,6 +120,7 @@ class Live:
                 f"the reference ends after {len(self.reference)} ticks",
                 hint="let [simulation] duration be longer",
             )
+
         position = np.asarray(position, dtype=np.float64)
         joints = self.machine.plant.joints
         if position.shape != (joints,):
@@ -130,6 +134,7 @@ class Live:
             if x is not None and x.shape != like.shape:
                 what = f"{name} has shape {x.shape}"
                 raise InputError(what, where="Live.command", hint=f"give {like.size} numbers")
+
         fresh = tuple(self._tick % hold == 0 for hold in self._holds)
         if self._tick == 0:
             path = jax.tree.map(lambda x: x[0], self._path)
@@ -146,6 +151,7 @@ class Live:
             start, saved = self._controller.start(tick, np.zeros_like(position), self._path), self.memory
             # A difference of readings of an earlier run and of this one would have no meaning.
             self.memory = start if saved is None else self._controller.resumed(start, saved)
+
         if self._online is not None and self.switched is None:
             self._identify(position)
         assert self._memory is not None, "the first tick has set it"

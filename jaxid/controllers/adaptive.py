@@ -155,11 +155,13 @@ class Adaptive(FeedForward):
             newest = jnp.where(jnp.isnan(tick.measured), memory.commands[0], tick.measured)
             newest = jnp.concatenate([newest[None], memory.commands[1:]])
             memory = eqx.tree_at(lambda m: m.commands, memory, newest)
+
         sample, ready = self._sample(tick, memory)
         rows, target, counts = self.estimator.rows(*sample)
         apart = self.stride if tick.acceleration is None else self.renewal
         recursion = self._recursion(memory.information, apart)
         new, _ = recursion.update(memory.recursion, rows, target, counts & ready & tick.fresh)
+
         done, share = memory.found.closed, memory.share
         closed = jax.lax.cond(
             done, lambda: jnp.ones((), bool), lambda: self._converged(recursion, new, share)

@@ -39,6 +39,7 @@ def run_demo(
     source = resources.files("jaxid.demo")
     write_results(folder, {name: (source / name).read_bytes() for name in _FILES}, overwrite=overwrite)
     case, log = folder / "case.toml", folder / "log.csv"
+
     progress("checking the log")
     checked = check(case, log)
     checked.save(folder, overwrite=overwrite)
@@ -46,6 +47,7 @@ def run_demo(
     identified.save(folder, overwrite=overwrite)
     discovered = discover(case, log, progress=progress)
     discovered.save(folder, overwrite=overwrite)
+
     shown = f"{folder}/case.toml {folder}/log.csv"
     text = "\n".join(
         [

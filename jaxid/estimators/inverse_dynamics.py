@@ -87,6 +87,7 @@ def inverse_dynamics_steps(
     whole = all(data.measured)
     places, (transform, damping) = parameters.places, linear_scale(machine, whole)
     options = (transform, parameters.bounds, damping)
+
     fits, size = [], np.zeros(())
     for at in [theta, *phase_starts(machine, theta), *shape_starts(machine, theta)]:
         fit, size = yield SolveRequest(solve_balance, (plant, places, arrays, at, *options))
@@ -96,10 +97,12 @@ def inverse_dynamics_steps(
     for at in [] if whole else _splits(machine, np.asarray(fits[0].theta), data.measured):
         fit, size = yield SolveRequest(solve_balance, (plant, places, arrays, at, *options))
         fits.append(fit)
+
     costs = [np.nan_to_num(float(f.cost), nan=np.inf) for f in fits]
     # Among the fits that reach the lowest cost, to rounding, prefer one that converged.
     lowest = [f for f, c in zip(fits, costs, strict=True) if c <= min(costs) * (1 + 1e-6)]
     fit = next((f for f in lowest if bool(f.converged)), lowest[0])
+
     for _ in range(2 if reweighted else 0):
         e = np.asarray(fit.residual).reshape(data.moving.shape)
         was = np.asarray(arrays.weight)
@@ -107,6 +110,7 @@ def inverse_dynamics_steps(
         e = np.where(was > 0, e / np.where(was > 0, was, 1.0), np.inf)
         arrays = eqx.tree_at(lambda a: a.weight, arrays, _robust(e, rows))
         fit, _ = yield SolveRequest(solve_balance, (plant, places, arrays, fit.theta, *options))
+
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = force_precision(machine, size, np.asarray(fit.theta), e, jacobian, rows)

@@ -207,6 +207,7 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
             damping,
         ),
     )
+
     rows = windows.weight > 0
     theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
@@ -218,6 +219,7 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
         float(unit * np.sqrt(rows.sum())),
         np.where(theta != 0, theta, 1.0),
     )
+
     converged = bool(fit.converged) and bool(np.all(np.isfinite(theta)))
     length = 2 * windows.half * data.period
     return Estimate(
@@ -251,12 +253,14 @@ def windows_of(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
             f"only {max(count, 0)} windows of {2 * half * period:.3g} s fit into the log",
             hint="take a longer log, or use inverse_dynamics",
         )
+
     slowest, halts = np.asarray(data.recipe.rest_velocity), _halts(machine.plant, data)
     speed = data.qd
     if not apart:
         share = _noise_shares(data)
         speed, slowest = (np.sqrt(np.sum((share * x) ** 2, axis=-1, keepdims=True)) for x in (speed, slowest))
         halts = np.any(halts, axis=1, keepdims=True)
+
     weigh = window((np.arange(2 * half) + 0.5) / half)
     middle = slice(half // 2, 2 * half - half // 2)
     cut = [slice(k, k + 2 * half) for k in first + half * np.arange(count)]
@@ -265,6 +269,7 @@ def windows_of(machine: Machine, data: Prepared) -> tuple[PowerData, float]:
     passes = np.stack([np.any(halts[c][middle], axis=0) for c in cut])
     # If windows without reversals are too few, those with reversals count too.
     counts = moves & ~passes if np.sum(moves & ~passes) >= fewest else moves
+
     mean = period * np.sqrt(np.where(counts, squares, 1.0) * np.sum(weigh**2))
     force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))
     return PowerData(ForceData.of(data), np.where(counts, 1 / mean, 0.0), half, first), force

@@ -310,8 +310,10 @@ def _corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[tuple[np.ndarr
                 at = yield from scored_at(member.problem._replace(kalman=shifted), own, p)
                 gradients.append(at.gradient)
         gradient[place] += np.mean(gradients, axis=0)
+
     if not any(np.any(read > 0) for read in reads):
         return end.theta, reads
+
     moved = x.copy()
     if np.all(np.isfinite(information)) and np.all(np.isfinite(gradient)):
         norm = np.sqrt(np.maximum(np.diag(information), 1e-300))

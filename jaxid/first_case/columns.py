@@ -125,6 +125,7 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
     questions: dict[str, str] = {}
     time = _time(columns, said, questions)
     rest = [c for c in columns if c is not time and c.meaning.quantity not in ("time", "passed over")]
+
     position, spare = _by_joint(rest, "position")
     velocity, _ = _by_joint(rest, "velocity")
     if not position and not velocity:
@@ -136,6 +137,7 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
     others = [c for c in others if not any(c is u for u in force.values())]
     reference = _references(others, position, spare, said, questions)
     velocity = _matched(velocity, joints)
+
     return Chosen(
         time,
         tuple(position.values()),
@@ -248,6 +250,7 @@ def _forces(
             said.append(f"'{column.name}' is passed over: {doubt}")
         else:
             usable.append(column)
+
     of_joint: dict[str, list[Column]] = {}
     for column in usable:
         of_joint.setdefault(" ".join(column.meaning.joint), []).append(column)
@@ -256,6 +259,7 @@ def _forces(
     else:
         chosen = {j: of_joint[j][0] for j in joints if j in of_joint}
         chosen = chosen if len(chosen) == len(joints) else {}
+
     if not chosen and not known and len(joints) == 1:
         silent = [c for c in others if not c.meaning.quantity and c.moves and not c.meaning.reference]
         silent = [c for c in silent if not any(_same_course(c.values, p.values) for p in position.values())]
@@ -266,6 +270,7 @@ def _forces(
             return {joints[0]: column}
         voltages = [c for c in others if c.meaning.quantity == "voltage" and c.moves]
         return {joints[0]: voltages[0]} if voltages else {}
+
     beside = [c for c in usable if not any(c is k for k in chosen.values())]
     if chosen and beside and len(joints) == 1:
         listed = ", ".join(f"'{c.name}'" for c in beside)

@@ -85,6 +85,7 @@ class Draft:
         plant.questions.append(
             "does gravity act along -z of the first link? Else gravity_vector = [x, y, z] in m/s^2"
         )
+
         table = self._log_table(arm.names)
         log = self._read(table)
         rough = []
@@ -92,6 +93,7 @@ class Draft:
             others = [log.position[:, j] for j in range(self._joints)]
             one = rough_balance(log.force[:, k], log.position[:, k], log.period, rotary=True, others=others)
             rough.append(one)
+
         frictions = [
             Section("[[effects]]", {"kind": kind, key: {"guess": [_positive(r, name) for r in rough]}})
             for kind, key, name in (
@@ -121,6 +123,7 @@ class Draft:
         if len(names) < len(robot.free):
             plant.keys["joints"] = list(names)
         servos = {drive.joint for drive in robot.drives if drive.kp is not None}
+
         if not chosen.force and not (chosen.reference and set(names) <= servos):
             raise InputError(no_force(chosen), where=self._raw.source, hint=NO_FORCE_HINT)
         plant.keys["unknown"] = [*unknown]
@@ -131,6 +134,7 @@ class Draft:
         plant.questions.append(
             'which values of the file are right? Take them out of unknown; "none": all are'
         )
+
         if not chosen.force:
             plant.assumed.append("no force is logged: the file's position servos follow the reference")
         elif robot.drives and chosen.force[0].meaning.quantity in ("torque", "force"):
@@ -141,6 +145,7 @@ class Draft:
             plant.questions.append(
                 "does gravity act along -z of the first link? Else gravity_vector = [x, y, z] in m/s^2"
             )
+
         table = self._log_table(names)
         motions = {joint.name: "rotary" if joint.motion == "revolute" else "linear" for joint in robot.joints}
         self._motions = tuple(motions[name] for name in names)
@@ -219,6 +224,7 @@ class Draft:
             section.keys["time"] = chosen.time.name
         else:
             section.keys["sample_rate"] = NO_TIME_RATE
+
         for quantity in ("position", "velocity", "force", "reference"):
             names = [c.name for c in getattr(chosen, quantity)]
             if quantity == "velocity" and chosen.position and not self._velocity_counts():
@@ -227,6 +233,7 @@ class Draft:
                 section.keys[quantity] = dict(zip(joints, names, strict=True))
             elif names:
                 section.keys[quantity] = names[0] if len(names) == 1 else names
+
         if measures.units:
             section.keys["units"] = {q: u for q, u in measures.units.items() if q in section.keys}
         if not section.keys.get("units", True):
@@ -238,6 +245,7 @@ class Draft:
             section.questions.append(
                 f"which of the {self._raw.contents.episodes} episodes? The first is taken"
             )
+
         lines = [line for line in chosen.said if not (steady and "no time" in line)]
         section.assumed += [*lines, *measures.said]
         asked = {**chosen.questions, **{q: t for q, t in measures.questions.items() if q not in ("force",)}}

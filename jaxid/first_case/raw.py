@@ -48,12 +48,14 @@ def raw_log(log: LogLike) -> RawLog:
             if values.dtype.kind in "fiub" and values.ndim == 1:
                 data[name] = values.astype(np.float64)[:, None]
         return RawLog(source, Contents(tuple(data)), data, units_of_table(log))
+
     path = Path(log)
     if not path.exists():
         beside = sorted(p.name for p in path.parent.glob("*" + path.suffix))
         hint = f"check the path; in that folder there is: {', '.join(beside[:8]) or 'none'}"
         raise InputError("no such file", where=str(path), hint=hint)
     contents = contents_of(path)
+
     names: list[str] = [contents.time] if contents.time else []
     names += [name for name in contents.names if name != contents.time]
     time = contents.time or next((n for n in names if meaning_of(n).quantity == "time"), None)
@@ -64,12 +66,14 @@ def raw_log(log: LogLike) -> RawLog:
         force=names[0] if names else "u",
         episode=0 if contents.episodes > 1 else None,
     )
+
     try:
         read = read_table(path, names, None, settings)
         columns, units, sparse = read.columns, dict(read.units), bool(read.sparse)
     except InputError:
         # One column of text or of another length is no reason to refuse the others.
         columns, units, sparse = _one_by_one(path, names, contents, settings)
+
     data = {name: values for name, values in columns.items() if values.shape[1] == 1}
     rows = max((len(v) for v in data.values()), default=0)
     data = {name: values for name, values in data.items() if len(values) == rows > 1}

@@ -209,6 +209,7 @@ def _motion(
         return "linear" if found.kind == "length" else "rotary"
     if wraps:
         return "rotary"
+
     if place.meaning.motion:
         said.append(f"the motion is {place.meaning.motion}, by the name '{place.name}'")
         return place.meaning.motion
@@ -219,6 +220,7 @@ def _motion(
         motion = "rotary" if kind == "torque" else "linear"
         said.append(f"the motion is {motion}, because '{force.name}' is a {kind}")
         return motion
+
     span = float(np.ptp(place.values)) if chosen.position else 0.0
     speed = max((float(np.abs(v.values).max()) for v in chosen.velocity), default=0.0)
     if span > _TURNS_BEYOND or speed > _FAST:
@@ -257,6 +259,7 @@ def _force(
             unit = "N" if motion == "linear" else "N m"
             said.append(f"'{column.name}' is taken to be in {unit}: nothing states its unit")
         return
+
     label = _LABELS.get(kind, "%" if kind == "percent" else "command")
     if kind in ("torque", "force"):
         label = "N m" if kind == "torque" else "N"
@@ -264,6 +267,7 @@ def _force(
         label = column.name
     if stated is not None and kind in ("current", "voltage") and stated.factor != 1.0:
         units["force"] = column.unit
+
     labels["force"] = label
     of = "" if label == column.name else f" of '{column.name}'"
     force = "N" if motion == "linear" else "N m"

@@ -72,6 +72,7 @@ def _delays(force: Signal, q: Signal, period: float) -> tuple[np.ndarray, np.nda
     """
     velocity = (q[2:] - q[:-2]) / (2.0 * period)
     acceleration = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / period**2
+
     best, chosen = _EXPLAINED, None
     for window in windows(q.size // _STRETCHES):
         f, a, v, x = (smooth(s, window) for s in (force[1:-1], acceleration, velocity, q[1:-1]))
@@ -82,9 +83,11 @@ def _delays(force: Signal, q: Signal, period: float) -> tuple[np.ndarray, np.nda
         explained = 1.0 - float(np.var(f - model) / np.var(f)) if np.var(f) > 0 else 0.0
         if explained > best:
             best, chosen = explained, (f, model, window)
+
     if chosen is None:
         return None
     f, model, window = chosen
+
     slope = np.gradient(model, period)
     edges = np.linspace(0, f.size, _STRETCHES + 1).astype(int)
     times, delays = [], []

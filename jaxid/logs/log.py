@@ -228,6 +228,7 @@ def steady_log(
             row = content.rows[0] + int(np.flatnonzero(~np.all(values > 0, axis=1))[0])
             hint = f"correct the row, or leave {name} out"
             raise InputError(f"{name} is not positive in row {row}", where=str(path), hint=hint)
+
     own, units = converted(groups, names, content.units, table, frame, str(path))
     spread = None
     if "scatter" in apart:
@@ -235,12 +236,14 @@ def steady_log(
         of_force = {"force": apart["scatter"]}
         turned = replace(table, sign=None)
         spread = np.abs(converted(of_force, names, content.units, turned, frame, str(path))[0]["force"])
+
     count = apart["samples"][:, 0] if "samples" in apart else None
     said = []
     resting = int(np.sum(~own["velocity"].any(axis=1)))
     if resting:
         what = "dry friction is undetermined at rest, so that they do not count"
         said.append(Assumed("rows at rest", resting, what))
+
     return Log(
         time=np.arange(len(own["velocity"]), dtype=float),
         position=np.zeros_like(own["velocity"]),

@@ -99,6 +99,7 @@ def resampled(
     # A few missing readings do not change the rate at which a sensor is read.
     found = deciding[slowest] if deciding[slowest] > _SLOWER * period else period
     new = 1.0 / rate if rate is not None else float(f"{found:.9g}")
+
     begin = max(c.time[0] for own in columns.values() for c in own)
     end = min(c.time[-1] for own in columns.values() for c in own)
     count = int(np.floor((end - begin) / new * (1 + 1e-9))) + 1
@@ -106,6 +107,7 @@ def resampled(
         what = "the columns have no time in common" if end <= begin else f"{count} samples at that rate"
         raise InputError(what, where=where, hint="check the times of the columns, and resample")
     time = begin + new * np.arange(count)
+
     out, said = {}, []
     costs: dict[str, list[str]] = {}
     for name, own in columns.items():
@@ -117,6 +119,7 @@ def resampled(
             words = _WORDS[kind].format(method=_BETWEEN[method])
             costs.setdefault(f"{words}; {_cost(operator, column, time, new)}", []).append(name)
         out[name] = np.concatenate(made, axis=1)
+
     why = "as stated" if rate is not None else f"the rate of {slowest}"
     said.append(Assumed("resample", float(f"{1 / new:.9g}"), f"Hz, {why}; {count} samples"))
     for words, those in costs.items():

@@ -344,6 +344,7 @@ def _factor(unit: Unit | None, quantity: str, column: int, table: LogTable, fram
         return _of_command(unit, column, frame, path)
     if quantity not in _QUANTITIES or quantity == "time":
         return 1.0 if unit is None else unit.factor
+
     at_motor = table.position_at == "motor" and quantity in (
         "position",
         "reference",
@@ -356,6 +357,7 @@ def _factor(unit: Unit | None, quantity: str, column: int, table: LogTable, fram
         if not at_motor:
             return 1.0
         unit = Unit("rad", "angle", 1.0)
+
     factor, kind = unit.factor, unit.kind
     if kind == "count":
         counts = table.counts_per_revolution
@@ -363,12 +365,14 @@ def _factor(unit: Unit | None, quantity: str, column: int, table: LogTable, fram
             hint = "state counts_per_revolution, or the size of a count: '0.5 um'"
             raise InputError(f"units.{quantity} is in counts of no known size", where=path, hint=hint)
         factor, kind = factor * _TURN / np.broadcast_to(counts, column + 1)[column], "angle"
+
     if kind == "angle" and at_motor:
         ratio = frame.drive("gear_ratio", column)
         if ratio is None:
             hint = "state gear_ratio in [actuator], or leave position_at out"
             raise InputError('position_at = "motor" needs the gear\'s ratio', where=path, hint=hint)
         factor /= ratio
+
     if kind == "angle" and motion == "linear":
         lead = frame.drive("lead", column)
         if lead is None:

@@ -52,6 +52,7 @@ def parameters_json(
     )
     known_more = {"std_misspecified": estimate.std_misspecified} if incomplete else {}
     more = {key: std for key, std in known_more.items() if std is not None}
+
     for k, (f, value, std, identifiable) in enumerate(rows):
         if names is not None and f.name not in names:
             continue
@@ -129,6 +130,7 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
     """
     fitted, others = gaps[: len(session.fits)], gaps[len(session.fits) :]
     unit, measured = session.machine.unit_by_joint, np.flatnonzero(session.fit.log.measured).tolist()
+
     out: dict[str, Any] = {
         "unit": unit("force"),
         "band_hz": _band(session),
@@ -153,6 +155,7 @@ def gap_json(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> dict[s
             },
         },
     }
+
     out["simulation"] |= _position_floor(session)
     if len(fitted) > 1:
         out["fits"] = {g.name: _of_one(g) for g in fitted}
@@ -336,6 +339,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
     judged = slice(fits, None) if len(after) > fits else slice(0, fits)
     machine = result.session.machine
     measured = np.flatnonzero(result.session.fit.log.measured).tolist()
+
     return {
         "verdict": result.verdict,
         "converged": result.converged,

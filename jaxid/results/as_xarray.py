@@ -21,11 +21,13 @@ def dataset_of(result: FitResult, log: str | int = 0) -> xr.Dataset:
         log = names[log]
     if log not in names:
         raise InputError(f"log {log!r} is not in this result", hint=suggest(str(log), names))
+
     run, gap = session.runs[names.index(log)], result.gaps[names.index(log)]
     joints = session.case.plant.names or tuple(str(k + 1) for k in range(run.log.position.shape[1]))
     label = session.machine.unit_by_joint
     position = {"units": _joined(label("position"))}
     force = {"units": _joined(label("force"))}
+
     signals = {
         "position": (("time", "joint"), run.log.position, position),
         "force": (("force_time", "joint"), gap.force.measured, force),
@@ -37,6 +39,7 @@ def dataset_of(result: FitResult, log: str | int = 0) -> xr.Dataset:
     }
     if gap.simulation is not None:
         signals["position_simulated"] = (("time", "joint"), gap.simulation.position, position)
+
     return xr.Dataset(
         signals,
         coords={

@@ -71,6 +71,7 @@ def precision_content(estimate: Estimate) -> dict[str, Any] | None:
     matrix = estimate.precision.covariance[np.ix_(shown, shown)]
     std = np.sqrt(np.diag(matrix))
     correlation = matrix / np.where(std > 0, np.outer(std, std), np.inf)
+
     pairs = [
         {"names": (names[i], names[j]), "value": correlation[i, j], "text": f"{correlation[i, j]:+.2f}"}
         for i in range(len(names))
@@ -81,6 +82,7 @@ def precision_content(estimate: Estimate) -> dict[str, Any] | None:
     few = 1 < len(names) <= _FEW
     strong = f"Correlations beyond {_STRONG} of {len(names)} parameters."
     none = f"No correlation of {len(names)} parameters is beyond {_STRONG}."
+
     profiles: Mapping[str, Mapping[str, Any]] = estimate.details.get("profiles", {})
     words = kind_words(estimate.precision.kind)
     return {

@@ -54,11 +54,13 @@ def _body(link: int, indices: dict[str, int], unknown: Sequence[Free], where: st
             where=where,
             hint=hint,
         )
+
     places = tuple(indices[name] for name in TEN)
     bounded = [unknown[k].name for k in places if np.isfinite([unknown[k].lower, unknown[k].upper]).any()]
     if bounded:
         what = f"{bounded[0]} has min or max, which physically_consistent does not keep"
         raise InputError(what, where=where, hint="leave them out")
+
     ten = jnp.asarray([unknown[k].guess for k in places])
     least = float(np.linalg.eigvalsh(np.asarray(pseudo_inertia(ten)))[0])
     x = np.asarray(log_cholesky(ten))
@@ -66,6 +68,7 @@ def _body(link: int, indices: dict[str, int], unknown: Sequence[Free], where: st
         what = f"its guess is no body: the least eigenvalue of its pseudo-inertia is {least:.3g}"
         hint = "start from mass, first_moment and inertia of a body: a rod, a ball"
         raise InputError(what, where=where, hint=hint)
+
     lower, upper = np.full(10, -np.inf), np.full(10, np.inf)
     # These coordinates are half the logarithm of the mass, and the logarithms of the extents.
     for coordinates, factor in (([0], 0.5), ([4, 5, 6], 1.0)):

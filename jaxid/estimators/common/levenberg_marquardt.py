@@ -257,6 +257,7 @@ def levenberg_marquardt(
             kept,
             jnp.zeros((kept.size, 0)),
         )
+
     # With jit the residual is traced once for both its shape and its Jacobian.
     residual, floor = jax.jit(residual), -jnp.inf
     if transform.affine:
@@ -267,6 +268,7 @@ def levenberg_marquardt(
     if transform.bodies:
         tolerance = max(tolerance, _BODY_TOLERANCE)
     max_steps = max_steps or (_BODY_STEPS if transform.bodies else 60)
+
     bounds = transform.bounds(jnp.asarray(lower), jnp.asarray(upper))
     x0 = jnp.clip(transform.inward(theta), *bounds)
     scale = jnp.where(transform.log | (x0 == 0), 1.0, jnp.abs(x0))
@@ -276,6 +278,7 @@ def levenberg_marquardt(
     solution = optx.least_squares(
         lambda x, args: on_scale(x), solver, x0, options=options, max_steps=max_steps, throw=False
     )
+
     # The value equals that of the state, but only the value carries the implicit derivatives.
     minimum = replace(solution.state, x=solution.value).minimum(transform)
     moves = jnp.ones(x0.size, bool) if active is None else jnp.asarray(active)
@@ -468,11 +471,13 @@ def advanced_by_model(
     ratio = (p.cost - cost) / jnp.maximum(p.predicted, 1e-300)
     shrink = jnp.where(first, 1.0, jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3))
     damping = jnp.clip(p.damping * jnp.where(better, shrink, p.growth), 1e-15, 1e20)
+
     x, cost, gradient, normal, kept, aux = jax.tree.map(
         lambda new, old: jnp.where(better, new, old),
         (p.trial, *model, kept, aux),
         (p.x, p.cost, p.gradient, p.normal, p.kept, p.aux),
     )
+
     nothing = jnp.where(first, _NOTHING * jnp.sqrt(2.0 * model[0]), p.nothing)
     # Checked at every step: a velocity has no effect while its friction level is zero, and one later.
     moves = moves & (p.scale * jnp.sqrt(jnp.diag(normal)) > nothing)

@@ -250,6 +250,7 @@ def _run_along(
     samples = [len(each.rows.rows) for each in logs]
     every = max(1, -(-sum(samples) // _MOST))
     histories, times, instruments, forgetting, began = [], [], [], [], 0.0
+
     for each in logs:
         recursion = replace(recursion, gains=each.gains, forgetting=_forgetting(each, settings))
         rows = each.rows
@@ -262,6 +263,7 @@ def _run_along(
         # The logs stand one behind the other in time.
         times.append(began + each.data.times[instants(len(rows.rows), every)])
         began = float(times[-1][-1]) + each.period
+
     return _Course(
         recursion=recursion,
         memory=memory,

@@ -91,6 +91,7 @@ def descent_steps(
         return Descent(x, best, False, steps)
     if not active.any():
         return Descent(x, best, True, steps)
+
     while steps < max_steps:
         pressed = ((x <= lower) & (best.gradient > 0)) | ((x >= upper) & (best.gradient < 0))
         aim = x + _step(best, damping, active & ~pressed)

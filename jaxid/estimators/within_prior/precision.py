@@ -225,6 +225,7 @@ def profiles_of(
     laplace = laplace_covariance(fit, noise)
     coloured = with_prior(fit, precision_of_directions(fit), laplace).whitened_covariance
     assert coloured is not None, "with_prior gives the covariance of all unknowns"
+
     for name in asked:
         k = names.index(name)
         if not precision.identifiable[k]:

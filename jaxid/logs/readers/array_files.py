@@ -207,10 +207,12 @@ def _column(path: Path, known: Mapping[str, Any], name: str) -> Float[np.ndarray
         raise InputError(f"has {values.ndim} dimensions", where=where, hint="save a matrix")
     if not values.size:
         raise InputError("is empty", where=where, hint="export the log again")
+
     values = np.atleast_1d(values).astype(np.float64)
     values = values[:, None] if values.ndim == 1 else values
     # A log has more samples than joints, so the longer side is time.
     values = values.T if values.shape[0] < values.shape[1] else values
+
     if base == name:
         return values
     index = int(name[len(base) + 1 : -1])

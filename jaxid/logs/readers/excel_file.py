@@ -113,10 +113,12 @@ def _of_sheet(
         if len(found) > 1:
             raise InputError(f"has {len(found)} columns '{name}'", where=str(path), hint="rename one of them")
         columns[name] = found[0]
+
     body = [row for row in cells[at + 1 :] if any(c is not None for c in row)]
     below = 0
     while below < min(_BELOW, len(body)) and not any(_is_number(c) for c in body[below]):
         below += 1
+
     units = {name: split_unit(header[k])[1] for name, k in columns.items()}
     if below:
         shown = ", ".join(str(c) for c in body[0] if c is not None)[:40]
@@ -128,6 +130,7 @@ def _of_sheet(
     body = body[below:]
     if not body:
         raise InputError("is empty below its header", where=str(path), hint="export the log again")
+
     first, end = resolve_rows(rows, len(body), path)
     out, sparse = {}, set()
     for name, k in columns.items():

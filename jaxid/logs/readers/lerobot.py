@@ -44,6 +44,7 @@ def read_lerobot(path: Path, names: list[str], rows: Rows | None, settings: LogT
     wanted = {name: _feature(name, features, path) for name in names}
     files = [path] if path.is_file() else sorted((root / "data").rglob("*.parquet"))
     episode = None if settings is None else settings.episode
+
     try:
         there = {
             f: np.unique(parquet.read_table(f, columns=["episode_index"])["episode_index"].to_numpy())
@@ -75,6 +76,7 @@ def read_lerobot(path: Path, names: list[str], rows: Rows | None, settings: LogT
     except Exception as error:
         what = f"cannot be read ({str(error) or type(error).__name__})"
         raise InputError(what, where=str(path), hint="is it a LeRobot dataset? download it again") from error
+
     arrays = {
         name: values[feature]
         if entry is None

@@ -72,6 +72,7 @@ def read_ros(path: Path, names: list[str], rows: Rows | None) -> Table:
             "the time of a message is of its header or of the recorder", where=str(path), hint=hint
         )
     wanted = {name: _column(name, path) for name in names if name not in clocks}
+
     try:
         store = typesys.get_typestore(typesys.Stores.LATEST)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
@@ -88,6 +89,7 @@ def read_ros(path: Path, names: list[str], rows: Rows | None) -> Table:
         raise InputError(
             what, where=str(path), hint="is it a ROS recording? `ros2 bag info` shows"
         ) from error
+
     times, said = _times(topics, clocks[0] == HEADER, path)
     readings = {
         name: (times[topic], np.concatenate(of.values[name]))
@@ -255,6 +257,7 @@ def _times(
     if not by_header:
         said = [Assumed("time", RECORDED, "the clock of the recorder, with the delay of the transport")]
         return {name: t - begin for name, t in recorded.items()}, said
+
     times, said, lines = {}, [], {}
     for name, of in topics.items():
         stamps = np.concatenate(of.stamps)
@@ -270,6 +273,7 @@ def _times(
     if len(lines) == 1 and len(times) == 1:
         name = next(iter(times))
         return {name: times[name] - times[name][0]}, said
+
     for name, (offset, drift) in lines.items():
         stamps = times[name]
         times[name] = stamps + offset + drift * (stamps - stamps[0]) - begin

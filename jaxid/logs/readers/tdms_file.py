@@ -43,6 +43,7 @@ def read_tdms(path: Path, names: list[str], rows: Rows | None) -> Table:
         # A damaged file raises errors of many kinds.
         what = f"cannot be read ({str(error) or type(error).__name__})"
         raise InputError(what, where=str(path), hint="is it a TDMS file? export it again") from error
+
     values = {name: _seconds(v) for name, v in values.items()}
     said: tuple[Assumed, ...] = ()
     sparse: frozenset[str] = frozenset()
@@ -57,6 +58,7 @@ def read_tdms(path: Path, names: list[str], rows: Rows | None) -> Table:
             time, columns = on_one_time({n: (t, values[n][:, None]) for n, t in tracks.items()})
             values = {WAVEFORM_TIME: time, **columns}
             sparse = frozenset(columns)
+
     columns, taken = pick_columns(path, values, names, rows)
     return Table(columns, taken, units, said, sparse)
 

@@ -26,6 +26,7 @@ def comparison_report(result: Comparison) -> str:
     unit = result.session.machine.unit_by_joint("force")
     units = [unit] * len(result.gaps[0].floor) if isinstance(unit, str) else list(unit)
     several = len(result.gaps[0].floor) > 1
+
     residuals = []
     for gap in result.gaps:
         for joint in np.flatnonzero(np.isfinite(gap.shared)):
@@ -37,6 +38,7 @@ def comparison_report(result: Comparison) -> str:
             picture = image(draw(_WIDE), words)
             picture["narrow"] = image(draw(_NARROW), words)["source"]
             residuals.append((name, picture))
+
     names = ", ".join(result.logs)
     return filled(
         "comparison.html",

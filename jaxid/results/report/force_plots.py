@@ -113,6 +113,7 @@ def draw_friction(ax: Axes, view: FrictionView, units: Mapping[str, str]) -> Non
     measured = () if view.force_measured is None else (view.force_measured,)
     factor, unit = scaled_unit(units["force"], [view.force, *measured])
     speed, speed_unit = scaled_unit(units["velocity"], [view.velocity])
+
     if view.velocity_measured is not None and view.force_measured is not None:
         x, y = view.velocity_measured / speed, drawable(view.force_measured) / factor
         few = len(x) <= 200
@@ -124,6 +125,7 @@ def draw_friction(ax: Axes, view: FrictionView, units: Mapping[str, str]) -> Non
         if not few:
             mean = binned_mean(x, y, bins=60, group=(x >= 0).astype(int))
             ax.plot(*mean, color=TEXT, lw=1.2, ls=(0, (4, 2)), label="their mean")
+
     # The curve jumps at rest, and so is drawn in two halves.
     gap = int(np.searchsorted(view.velocity, 0.0))
     cut = lambda line: np.insert(line, gap, np.nan)
@@ -132,6 +134,7 @@ def draw_friction(ax: Axes, view: FrictionView, units: Mapping[str, str]) -> Non
         low, high = (cut(drawable(end) / factor) for end in (view.low, view.high))
         ax.fill_between(x, low, high, color=AFTER, alpha=0.25, lw=0, label="95 % band")
     ax.plot(x, cut(drawable(view.force) / factor), color=AFTER, lw=1.6, label="model")
+
     ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
     dress(ax, f"velocity [{speed_unit}]", f"friction [{unit}]")
     place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1, "ncols": 4}

@@ -294,6 +294,7 @@ def draw_candidates(ax: Axes, step: SearchStep) -> None:
     right = max(scores.max(initial=0.0), step.threshold, 1e-9)
     # A candidate with a large loss must not compress the other bars.
     left = max(scores.min(initial=0.0), -0.5 * right)
+
     rows = np.arange(len(candidates))
     colors = [AFTER if c.accepted else _IDLE for c in candidates]
     ax.barh(rows, np.maximum(scores, left), color=colors, height=0.68)
@@ -306,6 +307,7 @@ def draw_candidates(ax: Axes, step: SearchStep) -> None:
         style["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
         at = (max(score, 0.0), row)
         ax.annotate(text, at, (4, 0), textcoords="offset points", **style)
+
     ax.axvline(step.threshold, color=BEFORE, lw=1.2, ls=(0, (4, 3)))
     ax.axvline(0.0, color=TEXT, lw=0.6)
     ax.set_title(f"threshold {short(step.threshold)}", loc="right", fontsize=FONT - 0.5, color=_DARK[BEFORE])

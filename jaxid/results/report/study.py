@@ -46,6 +46,7 @@ def study_report(result: Study) -> str:
             _drawn(plot_coverage, rows, "Coverage of 95 % intervals, by parameter"),
         ),
     ]
+
     folded = []
     for setting, own in conditions(table):
         title = f"Errors in units of their reported σ: {words_of(setting)}"
@@ -60,6 +61,7 @@ def study_report(result: Study) -> str:
                 "and above on the right: too wide; the other way round: too narrow; all on one side: biased."
             )
             folded.append((title, words, _drawn(plot_ecdf, own, title)))
+
     settings = [name for name in SETTINGS if name in table.dims]
     tried = "; ".join(
         f"{name.replace('_', ' ')} {', '.join(f'{x:g}' for x in table[name].values)}" for name in settings

@@ -179,6 +179,7 @@ def position_residuals(
             Residual(run.name, k, False, np.nan, float(floor[k]), excess=1.0, quantity="position")
             for k in joints
         ]
+
     least = _EXCESS if fitted else _EXCESS_ELSEWHERE
     out = []
     for k in joints:
