@@ -101,11 +101,11 @@ def test_a_fingerprint_is_of_the_contents():
 
 
 def test_a_session_builds_one_machine(monkeypatch):
-    from jaxid import session
+    from jaxid.session import opening
 
     built = []
-    build = session.build_machine
-    monkeypatch.setattr(session, "build_machine", lambda *a, **k: built.append(1) or build(*a, **k))
+    build = opening.build_machine
+    monkeypatch.setattr(opening, "build_machine", lambda *a, **k: built.append(1) or build(*a, **k))
     case = demo()
     case["log"].pop("reference")
     case["reference"] = {"kind": "csv", "file": str(DEMO / "log.csv"), "column": "ref", "time": "t"}
