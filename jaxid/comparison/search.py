@@ -130,12 +130,12 @@ class Search:
     def start(self, theta: Float[np.ndarray, " p"]) -> Model:
         """Return the model with one set of values for all logs, fitted from some values."""
         views = [log.samples.arrays[0].view for log in self.logs]
-        own = [theta.copy() if view is None else view.theta(theta) for view in views]
-        for values in own:
+        by_log = [theta.copy() if view is None else view.theta(theta) for view in views]
+        for values in by_log:
             for c in self.superset.candidates:
                 values[c.index] = c.neutral
         base = tuple(int(i) for i in self.superset.base)
-        return self.fit(Model(np.stack(own), base))
+        return self.fit(Model(np.stack(by_log), base))
 
     def run(self, start: Model, most: int) -> tuple[Model, list[Named]]:
         """Make changes until none is accepted, drop what became superfluous, and find alternatives.
@@ -216,8 +216,8 @@ class Search:
         screen = found.screen
         good = found.good
         if not any(_same(r.change, change) for r in found.refits):
-            own = self.refit(without, Scored(change, 0.0, _values_of(model, change)), screen)
-            good += [own] if not own.reason and own.evidence > screen.threshold else []
+            itself = self.refit(without, Scored(change, 0.0, _values_of(model, change)), screen)
+            good += [itself] if not itself.reason and itself.evidence > screen.threshold else []
         if not good:
             return without, None
         first = max(good, key=lambda r: r.evidence)
@@ -448,9 +448,9 @@ class Search:
         unknowns = model.unknowns
         for k, log in enumerate(self.logs):
             e, jacobian = log.evaluate(self.superset, model.theta[k], model.fitted_in(k))
-            own = [j for j, u in enumerate(unknowns) if k in u.logs]
+            shown = [j for j, u in enumerate(unknowns) if k in u.logs]
             columns = np.zeros((*e.shape, len(unknowns)))
-            columns[..., own] = jacobian[..., [unknowns[j].index for j in own]]
+            columns[..., shown] = jacobian[..., [unknowns[j].index for j in shown]]
             weight = log.samples.weight / log.smallest
             residuals.append((e * weight).ravel())
             jacobians.append((columns * weight[..., None]).reshape(-1, len(unknowns)))
@@ -503,9 +503,9 @@ def _contrasts(model: Model, change: Change) -> list[tuple[np.ndarray, float]]:
                 out.append((weights, float(neutral)))
         return out
     sets = model.partition(int(change.index or 0))
-    own = [s for s in sets if set(s) <= set(change.logs)]
-    rest = [s for s in sets if s not in own] or own[:1]
-    for logs in own:
+    inside = [s for s in sets if set(s) <= set(change.logs)]
+    rest = [s for s in sets if s not in inside] or inside[:1]
+    for logs in inside:
         if logs in rest:
             continue
         mine = np.array([float(u.index == change.index and u.logs == logs) for u in unknowns])
@@ -524,7 +524,7 @@ def _within(log: ComparedLog, other: ComparedLog) -> np.ndarray:
         return position, velocity
 
     inside = np.ones(log.counts.shape, bool)
-    for own, others in zip(motion(log), motion(other), strict=True):
+    for here, others in zip(motion(log), motion(other), strict=True):
         low, high = others.min(axis=0), others.max(axis=0)
-        inside &= (own >= low) & (own <= high)
+        inside &= (here >= low) & (here <= high)
     return inside

@@ -146,8 +146,8 @@ def _need_known_part(machine: Machine, log: Log) -> None:
     def residual(values: np.ndarray, speed: float, rate: float) -> np.ndarray:
         at = machine.parameters.insert(plant, values)
         states = at.initial_states(u)
-        own = at.balance(log.filled[0], speed * travel, rate * travel, u, jnp.zeros(()), states)
-        return np.asarray(own.residual)
+        balance = at.balance(log.filled[0], speed * travel, rate * travel, u, jnp.zeros(()), states)
+        return np.asarray(balance.residual)
 
     for k, f in enumerate(free):
         if not _is_force(plant, f):
@@ -187,8 +187,8 @@ def without_scale(machine: Machine, log: Log) -> list[str]:
             q, (qd, qdd) = jnp.asarray(log.filled[k]), rng.standard_normal((2, plant.joints))
             u = jnp.zeros(log.force.shape[1])
             states = at.initial_states(u)
-            own = at.balance(q, jnp.asarray(qd), jnp.asarray(qdd), u, jnp.zeros(()), states).residual
-            largest = max(largest, float(np.max(np.abs(np.asarray(own)))))
+            residual = at.balance(q, jnp.asarray(qd), jnp.asarray(qdd), u, jnp.zeros(()), states).residual
+            largest = max(largest, float(np.max(np.abs(np.asarray(residual)))))
         sizes.append(largest)
     return [f.name for f in forces] if sizes[0] <= _ROUNDING * sizes[1] else []
 

@@ -186,9 +186,9 @@ def _potential(machine: Machine, data: Prepared) -> np.ndarray:
         motion = machine.plant.motion(j) or machine.units.motion
         if motion == "rotary" and np.ptp(q) > _SWINGS:
             shapes += [np.sin(q), np.cos(q)]
-        own = np.asarray(filtered(np.stack(shapes, axis=1)))
-        block = np.zeros((len(own), joints, own.shape[1]))
-        block[:, j] = own
+        columns = np.asarray(filtered(np.stack(shapes, axis=1)))
+        block = np.zeros((len(columns), joints, columns.shape[1]))
+        block[:, j] = columns
         blocks.append(block)
     return np.concatenate(blocks, axis=2)
 

@@ -138,8 +138,8 @@ def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.
         band = (f > _BAND[0] * top) & (f < _BAND[1] * top)
         if band.sum() < _FREQUENCIES or machine.gain[k] == 0:
             continue
-        own = power[band] / np.log(2.0) - np.interp(f[band], f_all, of_position[:, j])
-        white = own / np.square(data.recipe.decimator.response(f[band], log.rate_hz))
+        excess = power[band] / np.log(2.0) - np.interp(f[band], f_all, of_position[:, j])
+        white = excess / np.square(data.recipe.decimator.response(f[band], log.rate_hz))
         density = max(float(np.median(white)), 0.0)
         out[k] = np.sqrt(density * log.rate_hz / 2) / abs(machine.gain[k])
     return out

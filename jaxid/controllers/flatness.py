@@ -36,8 +36,8 @@ def flat_inputs(plant: Plant, path: Path, drives: int) -> Float[Array, "time m"]
 
     def forces(q: Array, v: Array, a: Array) -> Array:
         none = jnp.zeros(drives)
-        own = plant.initial_states(none)
-        return plant.at_drives(plant.balance(q, v, a, none, jnp.zeros(()), own).residual)
+        internal = plant.initial_states(none)
+        return plant.at_drives(plant.balance(q, v, a, none, jnp.zeros(()), internal).residual)
 
     return jax.vmap(forces)(path.reference, *path.derivatives)
 
@@ -120,9 +120,9 @@ class Flatness(Controller):
         return jnp.where(jnp.abs(measured) < self.epsilon, measured, moved)
 
     def _acceleration(self, q: Array, v: Array, force: Array) -> Array:
-        own = self.model.initial_states(force)
+        internal = self.model.initial_states(force)
         reaction = self._reaction(q, v, force)
-        return acceleration(self.model, State(q, v, own), force, jnp.zeros(()), reaction)
+        return acceleration(self.model, State(q, v, internal), force, jnp.zeros(()), reaction)
 
     def _force(self, tick: Tick, velocity: Array, v: Array) -> Array:
         """Compute the force of the drives for accelerations v of the driven joints."""
@@ -130,14 +130,14 @@ class Flatness(Controller):
         none = jnp.zeros_like(v)
         asked = dict(zip(tick.driven, v, strict=True))
         wanted = jnp.stack([asked.get(i, jnp.zeros(())) for i in range(q.size)])
-        own, reaction = self.model.initial_states(none), self._reaction(q, velocity, none)
-        balance = self.model.balance(q, velocity, wanted, none, jnp.zeros(()), own, reaction)
+        internal, reaction = self.model.initial_states(none), self._reaction(q, velocity, none)
+        balance = self.model.balance(q, velocity, wanted, none, jnp.zeros(()), internal, reaction)
         return tick.at_drives(balance.residual)
 
     def _reaction(self, q: Array, velocity: Array, force: Array) -> Array:
         """Compute dry friction by port, with a sign that is linear within epsilon."""
-        own, ports = self.model.initial_states(force), jnp.zeros_like(self.model.ports(q))
+        internal, ports = self.model.initial_states(force), jnp.zeros_like(self.model.ports(q))
         zero = jnp.zeros_like(q)
-        level = self.model.balance(q, velocity, zero, force, jnp.zeros(()), own, ports).dry
+        level = self.model.balance(q, velocity, zero, force, jnp.zeros(()), internal, ports).dry
         speed = port_motion(self.model, q, velocity, zero)[1]
         return -level * sharp_clip(speed / self.epsilon, jnp.ones(()))

@@ -91,22 +91,22 @@ def _state_matrix(plant: Plant, held: tuple[int, ...]) -> Float[Array, "s s"]:
     """Compute the state matrix at rest: positions and velocities of the free joints, and internal states."""
     free = np.asarray([i for i in range(plant.joints) if i not in held], dtype=int)
     n, u = len(free), jnp.zeros(len(plant.driven(plant.joints)))
-    own, back = ravel_pytree(plant.initial_states(u))
+    internal, back = ravel_pytree(plant.initial_states(u))
     no_friction = jnp.zeros_like(plant.ports(jnp.zeros(plant.joints)))
 
-    def balance(q: Array, v: Array, a: Array, own: Array) -> tuple[Array, Array]:
+    def balance(q: Array, v: Array, a: Array, internal: Array) -> tuple[Array, Array]:
         q, v, a = (jnp.zeros(plant.joints).at[free].set(x) for x in (q, v, a))
-        b = plant.balance(q, v, a, u, jnp.zeros(()), back(jnp.asarray(own)), no_friction)
+        b = plant.balance(q, v, a, u, jnp.zeros(()), back(jnp.asarray(internal)), no_friction)
         return b.residual[free], ravel_pytree(b.rates)[0]
 
     zero = jnp.zeros(n)
-    forces, rates = jax.jacfwd(balance, argnums=(0, 1, 2, 3))(zero, zero, zero, own)
+    forces, rates = jax.jacfwd(balance, argnums=(0, 1, 2, 3))(zero, zero, zero, internal)
     by_q, _, mass, by_own = forces
     # Without the column of the velocities, which is the damping.
     a_q, a_own = (-jnp.linalg.solve(mass, x) for x in (by_q, by_own))
     return jnp.block(
         [
-            [jnp.zeros((n, n)), jnp.eye(n), jnp.zeros((n, own.size))],
+            [jnp.zeros((n, n)), jnp.eye(n), jnp.zeros((n, internal.size))],
             [a_q, jnp.zeros((n, n)), a_own],
             [rates[0] + rates[2] @ a_q, rates[1], rates[3] + rates[2] @ a_own],
         ]

@@ -43,25 +43,25 @@ def integrate_internal_states(
     if not jax.tree.leaves(first):
         return first
     motion = (q, qd, qdd, u, start + period * jnp.arange(q.shape[0]))
-    own = jax.tree.map(lambda z: jnp.broadcast_to(z, (q.shape[0], *jnp.shape(z))), first)
+    internal = jax.tree.map(lambda z: jnp.broadcast_to(z, (q.shape[0], *jnp.shape(z))), first)
     for wave in _waves(plant, first, u.shape[1]):
         numbers = [i for i in wave if not first[i].ndim]
         vectors = [i for i in wave if first[i].ndim]
         held = {i: jnp.zeros_like(first[i]) for i in wave}
-        push = _rates(plant, motion, own, held)
+        push = _rates(plant, motion, internal, held)
         found = {}
         if numbers:
-            moved = _rates(plant, motion, own, held | {i: jnp.ones_like(first[i]) for i in numbers})
+            moved = _rates(plant, motion, internal, held | {i: jnp.ones_like(first[i]) for i in numbers})
             columns = [jnp.stack([x[i] for i in numbers], axis=1) for x in (push, moved)]
             starts = jnp.stack([first[i] for i in numbers])
             together = _recurrence(starts, columns[1] - columns[0], columns[0], period)
             found |= dict(zip(numbers, together.T, strict=True))
-        here = jax.tree.map(lambda a: a[0], (*motion, own))
+        here = jax.tree.map(lambda a: a[0], (*motion, internal))
         for size in {first[i].size for i in vectors}:
             slopes = _slopes(plant, here, [i for i in vectors if first[i].size == size], size)
             found |= {i: _vector_recurrence(first[i], a, push[i], period) for i, a in slopes.items()}
-        own = tuple(found.get(i, z) for i, z in enumerate(own))
-    return own
+        internal = tuple(found.get(i, z) for i, z in enumerate(internal))
+    return internal
 
 
 def _waves(plant: Plant, first: tuple, drives: int) -> list[list[int]]:
@@ -99,18 +99,18 @@ def _uses_drive(effect: Effect, state: Array) -> bool:
     return depends(lambda u: effect.act(Signals(**still | {"u": u}), state).rate, (zero,))
 
 
-def _rates(plant: Plant, motion: tuple, own: tuple, values: Mapping[int, Any]) -> dict[int, Array]:
+def _rates(plant: Plant, motion: tuple, internal: tuple, values: Mapping[int, Any]) -> dict[int, Array]:
     """Return the rates of some internal states along a motion, each state held at a value."""
-    at = tuple(jnp.broadcast_to(values[i], z.shape) if i in values else z for i, z in enumerate(own))
+    at = tuple(jnp.broadcast_to(values[i], z.shape) if i in values else z for i, z in enumerate(internal))
     return jax.vmap(lambda *now: {i: balance_of(plant, *now).rates[i] for i in values})(*motion, at)
 
 
 def _slopes(plant: Plant, here: tuple, vectors: list[int], size: int) -> dict[int, Array]:
-    """Return the derivatives of rates by their own states, vectors of one size, at one instant."""
-    *motion, own = here
+    """Return the derivatives of rates by their internal states, vectors of one size, at one instant."""
+    *motion, internal = here
 
     def rates(shift: Array) -> dict[int, Array]:
-        at = tuple(z + shift if i in vectors else z for i, z in enumerate(own))
+        at = tuple(z + shift if i in vectors else z for i, z in enumerate(internal))
         whole = balance_of(plant, *motion, at).rates
         return {i: whole[i] for i in vectors}
 
@@ -197,17 +197,17 @@ def balance_along(
         period: Sampling time [s].
         start: Time of the first sample [s].
     """
-    own = integrate_internal_states(plant, q, qd, qdd, u, period, start)
+    internal = integrate_internal_states(plant, q, qd, qdd, u, period, start)
     times = start + period * jnp.arange(q.shape[0])
 
-    def at(q: Array, qd: Array, qdd: Array, u: Array, t: Array, own: tuple) -> tuple:
-        balance = balance_of(plant, q, qd, qdd, u, t, own)
+    def at(q: Array, qd: Array, qdd: Array, u: Array, t: Array, internal: tuple) -> tuple:
+        balance = balance_of(plant, q, qd, qdd, u, t, internal)
         return balance.residual, balance.drive
 
     if plant.coupled:
         # Along a batch the recursion over links runs through memory: it takes six times as long.
-        return jax.lax.map(lambda now: at(*now), (q, qd, qdd, u, times, own))
-    return jax.vmap(at)(q, qd, qdd, u, times, own)
+        return jax.lax.map(lambda now: at(*now), (q, qd, qdd, u, times, internal))
+    return jax.vmap(at)(q, qd, qdd, u, times, internal)
 
 
 def residual_along(
@@ -232,7 +232,7 @@ def drive_ratio(
     """
     tiny = 1e-300
     squares = [jnp.sum(x**2, axis=0) for x in (drive, u)]
-    own = jnp.sqrt((squares[0] + tiny) / (squares[1] + tiny))
+    by_drive = jnp.sqrt((squares[0] + tiny) / (squares[1] + tiny))
     whole = jnp.sqrt((jnp.sum(squares[0]) + tiny) / (jnp.sum(squares[1]) + tiny))
     places = [plant.drive_of(i, u.shape[1]) for i in range(joints)]
-    return jnp.stack([whole if j is None else own[j] for j in places])
+    return jnp.stack([whole if j is None else by_drive[j] for j in places])

@@ -71,8 +71,8 @@ def kept_jit(function: Callable[P, T]) -> Callable[P, T]:
         with locks.setdefault(key, threading.Lock()):
             if key not in calls:
                 calls[key] = _ready(function, structure, leaves, arrays, key)
-        own = calls[key]
-        return plain(*args, **kwargs) if own is None else own([np.asarray(x) for x in arrays])
+        compiled = calls[key]
+        return plain(*args, **kwargs) if compiled is None else compiled([np.asarray(x) for x in arrays])
 
     return call
 
@@ -159,8 +159,8 @@ def _compiled(
 
     kept: dict[str, Any] = {}
 
-    def flat(own: list) -> list:
-        rest = iter(own)
+    def flat(values: list) -> list:
+        rest = iter(values)
         given = [next(rest) if isinstance(x, _ARRAYS) else x for x in leaves]
         args, kwargs = jax.tree.unflatten(structure, given)
         out, shape = jax.tree.flatten(function(*args, **kwargs))
@@ -217,8 +217,8 @@ def _arrays_in(skeleton: Any) -> int:
 def _calling(compiled: Any, skeleton: Any) -> Callable[[list], Any]:
     holes, shape = jax.tree.flatten(skeleton)
 
-    def call(own: list) -> Any:
-        rest = iter(compiled(own))
+    def call(arrays: list) -> Any:
+        rest = iter(compiled(arrays))
         return jax.tree.unflatten(shape, [next(rest) if x is _Array else x for x in holes])
 
     return call

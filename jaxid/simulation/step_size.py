@@ -77,15 +77,15 @@ def fastest_rate(plant: Plant, q: Array, u: Array) -> Array:
 
     def rate(q: Array, u: Array) -> Array:
         zero = jnp.zeros_like(q)
-        own = plant.initial_states(u)
+        internal = plant.initial_states(u)
         none = jnp.zeros_like(plant.ports(q))
 
         def acc(q: Array, v: Array) -> Array:
-            return acceleration(plant, State(q, v, own), u, jnp.zeros(()), none)
+            return acceleration(plant, State(q, v, internal), u, jnp.zeros(()), none)
 
         stiffness, damping = (_slope(of) for of in jax.jacfwd(acc, argnums=(0, 1))(q, zero))
         motion = jnp.maximum(jnp.sqrt(stiffness), damping)
-        return jnp.maximum(motion, _swing(plant, State(q, zero, own), u, none))
+        return jnp.maximum(motion, _swing(plant, State(q, zero, internal), u, none))
 
     return jax.vmap(rate)(q, u).max()
 
@@ -107,8 +107,8 @@ def _swing(plant: Plant, x: State, u: Array, reaction: Array) -> Array:
             continue
 
         def rates(value: Array, i: int = i) -> Array:
-            own = (*x.own[:i], value, *x.own[i + 1 :])
-            return derivative(plant, State(x.q, x.qd, own), u, jnp.zeros(()), reaction).own[i]
+            internal = (*x.own[:i], value, *x.own[i + 1 :])
+            return derivative(plant, State(x.q, x.qd, internal), u, jnp.zeros(()), reaction).own[i]
 
         slope = jax.jacfwd(rates)(z)
         frequency = jnp.sqrt(jnp.abs(slope[0, 0] * slope[1, 1] - slope[0, 1] * slope[1, 0]))
