@@ -82,14 +82,14 @@ def logs_of(
 
 
 def _ordered(true: Mapping[str, float], names: Sequence[str]) -> np.ndarray:
-    """What is true in the order of some unknowns."""
+    """Return the true values in the order of some unknowns."""
     return np.array([true[n] for n in names])
 
 
 def off_in_sigma(
     estimate: Estimate, case: Path, log: Log, start: float, true: Mapping[str, float]
 ) -> np.ndarray:
-    """By how many of its standard deviations each direction is off the truth, the motor's start included."""
+    """Return how far each direction is from the truth, in its standard deviations, the start included."""
     machine = open_session(case, log).machine
     w = Prior.of(machine, PRIOR, np.zeros(0)).inward(_ordered(true, estimate.names))
     truth = dict(zip(estimate.names, w, strict=True))
@@ -110,7 +110,7 @@ def case_of(
     more: str = ON_FORCE,
     **stated: Any,
 ) -> Path:
-    """A case file; guesses at the truth, drawn up to 50 % around it, or as the prior says that they are."""
+    """Write a case file; guesses are the truth, drawn up to 50 % around it, or as the prior says."""
     draw = stages.believed if believed else stages.drawn
     drawn = None if guess is None else draw(guess, PRIOR, data)
     path = folder / f"{name}.toml"
@@ -146,7 +146,7 @@ def studied(
 def judged(
     estimate: Estimate, case: Path, log: Log, start: float, true: Mapping[str, float], percent: float
 ) -> dict[str, Any]:
-    """What came of a fit: its criterion over that of the truth, its directions in sigma from the truth.
+    """Return the facts of a fit: its criterion over that of the truth, its directions off in sigma.
 
     `percent`: the criterion of the truth. "nats": by how much the truth is less probable than what was found,
     the guesses counted in; of exact encoders, for it leaves the motor's start out.
@@ -172,7 +172,7 @@ def apart(
     starts: np.ndarray,
     truths: Sequence[Mapping[str, float]],
 ) -> list[dict[str, Any]]:
-    """What came of each fit, one to a core at a time: of many steps each, they are slower side by side.
+    """Fit each log by itself, one to a core at a time: of many steps each, they are slower side by side.
 
     Each is a line of a file as soon as it ends, and those that the file has are not run again.
     """
@@ -196,7 +196,7 @@ def apart(
 
 
 def _fitted(run: int, case: Path, log: Log, start: float, true: Mapping[str, float]) -> dict[str, Any]:
-    """What came of one fit. By itself, but not by `identify`: its gaps are compiled anew for each."""
+    """Fit one log by itself, but not by `identify`, whose gaps are compiled anew for each log."""
     (estimate,) = identify_many(case, [log], lanes=1)
     if isinstance(estimate, jaxid.InputError):
         return {"run": run, "refused": str(estimate)}

@@ -130,7 +130,7 @@ def unrecorded(folder: Path, runs: int) -> None:
 
 
 def position(folder: Path, runs: int) -> None:
-    """The position in place of the current, which the paper says goes wrong: whether and why."""
+    """Fit the position in place of the current, which the paper says goes wrong, and show the cause."""
     table = Table(
         f"Output error on current and on position: {runs // 2} runs of data 1, and 64 starts 50 % off",
         [
@@ -271,7 +271,7 @@ def load(folder: Path, runs: int) -> None:
 
 
 def needles(folder: Path, runs: int) -> None:
-    """What simulating the encoder's rounding makes of the cost: a bed of needles."""
+    """Draw the cost with and without simulated rounding of the encoder: it has many narrow minima."""
     start = time.perf_counter()
     case = case_of(folder, "needles", 1, more=bogdan_figures.SIMULATED)
     bogdan_figures.needles(folder / "needles.png", jaxid.load_case(case))
@@ -285,7 +285,7 @@ def frictions(folder: Path, runs: int) -> None:
 
 
 def hidden(folder: Path, runs: int) -> None:
-    """A fit with Coulomb and viscous friction only: what `discover` names on a log that shows it."""
+    """Search a log for friction that a case with Coulomb and viscous friction only lacks."""
     start = time.perf_counter()
     case, log = stages.long_case(folder, stages.to_and_fro())
     found = jaxid.discover(case, log)
@@ -294,7 +294,7 @@ def hidden(folder: Path, runs: int) -> None:
 
 
 def one_way(folder: Path, runs: int) -> None:
-    """As `hidden`, of a log that never turns: by its forces, and in the simulated loop."""
+    """Search a log without reversals, by its forces and in the simulated loop."""
     case, log = stages.long_case(folder, stages.one_way())
     stated = case.read_text()
     for name, more in (("one_way", ""), ("one_way_in_the_loop", ON_FORCE)):
@@ -306,7 +306,7 @@ def one_way(folder: Path, runs: int) -> None:
 
 
 def named(case: Path, log: Log) -> str:
-    """What `discover` names, or its verdict."""
+    """Return the effects that `discover` names, or its verdict."""
     found = jaxid.discover(case, log)
     return " + ".join(e.label for e in found.effects) or found.verdict
 
@@ -316,7 +316,7 @@ QUIET = 2e-3
 
 
 def short(folder: Path, runs: int) -> None:
-    """The same in a hundred samples: by how much the whole model is likelier, and what `discover` names."""
+    """Compare models on a hundred samples: the gain of the true one, and the result of `discover`."""
     table = Table(
         f"Plain friction fitted to {runs} logs of 100 samples: nats by which the true model is likelier",
         ["data", "encoder", "noise [mA]", "median", "most", "verdicts of discover on the first 8"],

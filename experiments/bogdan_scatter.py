@@ -34,7 +34,7 @@ COLUMNS = [
 
 
 def _cells(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Of many runs, under `COLUMNS`; "never above": the criterion, that of the truth."""
+    """Return the cells of many runs, under `COLUMNS`; the criterion is compared with that of the truth."""
     off = np.abs(np.concatenate([r["off"] for r in rows]))
     mean = lambda key: np.mean([r[key] for r in rows])
     # A stage far off the guesses may not simulate with the steps that those ask for: then there is none.
@@ -92,12 +92,12 @@ def nearest(folder: Path, runs: int) -> None:
 
 
 def elastic(folder: Path, runs: int) -> None:
-    """As `scatter`, of the elastic screw, in the model too; the table has no encoder."""
+    """Fit logs of the elastic screw, with it in the model; the table has no encoder."""
     _elastic(folder, "elastic", [stages.TRUTH[1]] * runs, range(1000, 1000 + runs))
 
 
 def calibrated(folder: Path, runs: int) -> None:
-    """The guesses are the table, and each log is of a stage off them as the prior says; as `elastic` at last.
+    """Fit logs of stages drawn about the table as the prior says, with the table as guesses.
 
     Intervals of a fit within a prior promise what they hold of all stages that the prior takes for likely. Of
     one stage, of which all that its logs do not tell is the same in each, they may hold more or less. Stages

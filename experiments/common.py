@@ -1,4 +1,4 @@
-"""What the experiments share: the data's folder, a place for results, a table."""
+"""Parts that the experiments share: the folder of the data, a place for results, a table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def parser_of(doc: str, default: str) -> argparse.ArgumentParser:
 
 
 def arguments(doc: str, default: str) -> argparse.Namespace:
-    """What was asked on the command line of an experiment."""
+    """Parse the command line of an experiment."""
     return parser_of(doc, default).parse_args()
 
 
@@ -36,7 +36,7 @@ def run_studies(doc: str, default: str, studies: Mapping[str, Callable[[Path], N
 
 
 def case_with_data(folder: Path, cases: tuple[str, ...], data: str, files: tuple[str, ...]) -> Path:
-    """A folder with case files and links to the measured logs beside them.
+    """Make a folder with case files and links to the measured logs beside them.
 
     So every number of an experiment can be had by hand with a `jaxid` command in that folder.
     """
@@ -52,7 +52,7 @@ def case_with_data(folder: Path, cases: tuple[str, ...], data: str, files: tuple
 
 
 def copied(folder: Path, cases: tuple[str, ...]) -> Path:
-    """A folder with case files in it."""
+    """Copy case files to a folder, and return the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in cases:
         shutil.copyfile(Path(__file__).parent / "cases" / name, folder / name)

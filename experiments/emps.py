@@ -30,7 +30,7 @@ METHODS = ("inverse_dynamics", "instrumental_variable", "didim", "power")
 
 
 def recipe(folder: Path, log: Path) -> None:
-    """The published model by the published recipe."""
+    """Identify the published model by the published recipe."""
     start = time.perf_counter()
     result = jaxid.identify(folder / "emps_recipe.toml", log, method="inverse_dynamics")
     result.save(folder / "recipe")
@@ -45,7 +45,7 @@ def recipe(folder: Path, log: Path) -> None:
 
 
 def methods(folder: Path, log: Path) -> None:
-    """The published model by every method, each beside the published values and on the second file.
+    """Identify the published model by every method, beside the published values and on the second file.
 
     The recipe compares the held command at the instants of logging, as published: half a sample early.
     `output_error` simulates the hold, and `inverse_dynamics` sees it with `align_hold`: both tell more
@@ -84,7 +84,7 @@ def methods(folder: Path, log: Path) -> None:
 
 
 def missing(folder: Path, log: Path) -> None:
-    """What is missing beside inertia and viscous friction, and how close the loop then comes."""
+    """Search for effects beside inertia and viscous friction, and show how close the loop then comes."""
     start = time.perf_counter()
     found = jaxid.discover(folder / "emps_bare.toml", log)
     found.save(folder / "discover")

@@ -73,7 +73,7 @@ rate = {1 / UPDATE}
 
 
 def robot(scale: float = 1.0, **changed: float) -> Robot:
-    """The robot; `scale`: of all friction."""
+    """Return the robot, with all friction times `scale`."""
     return replace(Robot(friction={k: scale * np.array(v) for k, v in FRICTION.items()}), **changed)
 
 
@@ -109,7 +109,7 @@ def case_text(
     inertial: bool = True,
     period: float = PERIOD,
 ) -> str:
-    """A case: the model of the robot, a law for [controller], random targets."""
+    """Return a case: the model of the robot, a law for [controller], random targets."""
     gains = ", ".join(map(str, (gain, gain) if isinstance(gain, str) else gain))
     plant = PLANT.replace("tip_mass = 2.72", f"tip_mass = {tip_mass}")
     return f"""{plant}[[effects]]
@@ -165,12 +165,12 @@ class Ran:
 
     @property
     def error(self) -> np.ndarray:
-        """Of position [rad]."""
+        """Error of the position [rad]."""
         return self.q - self.live.reference[: len(self.q)]
 
 
 def along(live: jaxid.Live, what: Callable) -> tuple[np.ndarray, ...]:
-    """What a function of position, velocity and acceleration is at every tick of a loop's reference."""
+    """Evaluate a function of position, velocity and acceleration at every tick of a loop's reference."""
     r = live.reference
     v = np.gradient(r, live.period, axis=0)
     return tuple(np.asarray(x) for x in jax.jit(jax.vmap(what))(r, v, np.gradient(v, live.period, axis=0)))

@@ -195,7 +195,7 @@ def _sound(found: jaxid.Identification) -> bool:
 
 
 def trajectories(folder: Path) -> bool:
-    """What a trapezoid, pulses and a chirp tell of the friction split."""
+    """Compare the split of friction that a trapezoid, pulses and a chirp identify."""
     begin = time.perf_counter()
     t = np.arange(8000) / axes.RATE
     # From 0.5 to 40 Hz, at a speed that stays the same.
@@ -249,7 +249,7 @@ def added_mass(folder: Path) -> bool:
 
 
 def motor_alone(folder: Path) -> bool:
-    """What the third minimal model cannot tell: friction split and damping, by output error."""
+    """Show that the motor alone does not identify the split of friction and damping, by output error."""
     begin = time.perf_counter()
     scene = (
         '\n[reference]\nkind = "trapezoid"\ntargets = [0.2, 0.0]\nspeed = 0.2\nacceleration = 2.0\n'
@@ -308,7 +308,7 @@ def _cell(errors: dict[str, float], name: str) -> str:
 
 
 def hidden(folder: Path) -> bool:
-    """A rigid model of the flexible axis; clearance that the flexible one lacks."""
+    """Search for a flexible joint that a rigid model lacks, and for clearance that the flexible one lacks."""
     begin, good = time.perf_counter(), True
     cases = {
         "joint_flexibility": (axes.machine(), axes.rigid_text()),

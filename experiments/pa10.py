@@ -114,7 +114,7 @@ FRICTION = case_text(
 
 
 def plateaus() -> tuple[np.ndarray, np.ndarray]:
-    """A reference of trapezoids of velocity up to the fastest, each way, and its velocity."""
+    """Return a reference of trapezoids of velocity up to the fastest, each way, and its velocity."""
     parts = []
     for top in np.linspace(0.1, FASTEST, 8):
         ramp = np.linspace(0.0, top, 200, endpoint=False)
@@ -125,7 +125,7 @@ def plateaus() -> tuple[np.ndarray, np.ndarray]:
 
 
 def by_means(speed: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """The report's way: the mean torque of every plateau, and a line through those of either direction."""
+    """Fit as the report does: the mean torque of every plateau, and a line through those of a direction."""
     flat = np.flatnonzero(np.diff(speed) == 0)
     pieces = np.split(flat, np.flatnonzero(np.diff(flat) > 1) + 1)
     points = np.array([(speed[p[0]], torque[p[len(p) // 3 :]].mean()) for p in pieces if len(p) > 500])
@@ -171,7 +171,7 @@ def _until(log: dict[str, np.ndarray]) -> float:
 
 
 def limit_cycle(folder: Path) -> None:
-    """What swings in situation s4 with a spring: its amplitude, and what sampling does to it."""
+    """Show the limit cycle of situation s4 with a spring: its amplitude, and the effect of sampling."""
     start = time.perf_counter()
     table = Table(
         "amplitude [rad] in s4 after starts of 0.8, 1 and 3 times the analytic (4/pi) v_a sqrt(I/K_p)",
@@ -220,7 +220,7 @@ def dominant(folder: Path) -> None:
 
 
 def flexible(kp: float, stiffness: float) -> dict[str, np.ndarray]:
-    """The same joint of which half the inertia sits behind a spring; friction and encoder at the motor."""
+    """Fit the joint with half of its inertia behind a spring; friction and encoder are at the motor."""
     machine = ChainMachine(
         [INERTIA / 2, INERTIA / 2],
         [0.0, 0.0],
@@ -249,7 +249,7 @@ SWUNG = {
 
 
 def same_logs(folder: Path) -> None:
-    """What the log of a swing tells by other methods, and what `discover` says of viscous friction alone."""
+    """Identify the log of a swing by other methods, and search it from viscous friction alone."""
     start = time.perf_counter()
     # Read finely: what the reading's noise does in the loop's difference would shake the joint.
     made = swinging(400.0, 0.3, duration=8.0, sensor=Sensor(position_noise=1e-7, force_noise=0.2), step=5e-6)

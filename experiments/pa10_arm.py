@@ -143,7 +143,7 @@ def excitation(folder: Path) -> None:
 
 
 def identification(folder: Path) -> None:
-    """The whole arm in its loop from a noisy log of other physics: torque of another motion, over its noise.
+    """Identify the whole arm in its loop from a noisy log of other physics; predict another motion.
 
     The loop is a PD law of 200 Hz that follows the design for the determinant; links are Pinocchio's, and
     friction sticks exactly, in steps of 0.1 ms. Encoders have noise of 1e-6 rad, torques that of the case.
@@ -207,7 +207,7 @@ def random_bodies(rng: np.random.Generator) -> np.ndarray:
 
 
 def arm_of(bodies: np.ndarray) -> arm_stepper.Arm:
-    """The PA-10 of such links, with exact friction in every joint."""
+    """Return the PA-10 with some links and exact friction in every joint."""
     axes, origins = (np.asarray(x) for x in pa10().frames(np.zeros(7)))
     return arm_stepper.Arm(axes, origins, bodies, VISCOUS, COULOMB)
 
@@ -257,12 +257,12 @@ def _left(plant: SerialArm, m: Excitation, measured: np.ndarray) -> np.ndarray:
 
 
 def _rms(x: np.ndarray, m: Excitation) -> np.ndarray:
-    """By joint, where it moves."""
+    """Return the RMS by joint over the samples in which it moves."""
     return np.sqrt(np.nanmean(np.where(np.abs(m.velocity) > 0.02, x, np.nan) ** 2, axis=0))
 
 
 def _ball(line: str) -> str:
-    """A line of the case with a ball for what it says of a link."""
+    """Return a line of the case with a ball in place of a link's parameters."""
     key = line.partition(" = ")[0]
     free = lambda *values: "[" + ", ".join(f"{{ guess = {v} }}" for v in values) + "]"
     balls = {

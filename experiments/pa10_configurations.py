@@ -70,7 +70,7 @@ def limit_cycle(k: int, inertia: float, rate: float = RATE, average: int = 1) ->
 
 
 def swing(k: int, inertia: float, sensor: Sensor = EXACT, average: int = 1) -> tuple[Loop, dict]:
-    """A swing where viscous friction alone is compensated, and Coulomb friction left to the joint."""
+    """Simulate a swing in which viscous friction is compensated, and Coulomb friction left to the joint."""
     kp = STIFFNESS[k]
     duration = 1.6 * 2 * np.pi * np.sqrt(LARGEST[k] / kp)
     loop = Loop(
@@ -102,7 +102,7 @@ def turning(log: dict[str, np.ndarray]) -> float:
 
 
 def identified(folder: Path, method: str) -> Callable[[int, float], float]:
-    """The same inertia from the swing's noisy log, guesses off by half."""
+    """Identify the inertia from the noisy log of the swing, with guesses off by half."""
 
     def inertia_of(k: int, inertia: float) -> float:
         loop, made = swing(k, inertia, FINE)
@@ -202,7 +202,7 @@ def solve(
     measured: np.ndarray,
     known: tuple[str, ...] = (),
 ) -> DominantInertias:
-    """What joint k, from 1, tells of the sums that are not known; all else is as the plant has it."""
+    """Solve for the unknown sums that joint k, from 1, determines; the others are those of the plant."""
     rest = tuple(n for n in base.names if n not in base.chosen_names)
     return from_dominant_inertias(plant, k, q, measured, (*KNOWN, *rest, *known))
 
@@ -221,5 +221,5 @@ def inertias(bodies: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def inertias_of(plant: SerialArm, q: np.ndarray) -> np.ndarray:
-    """The same of a plant that was identified."""
+    """Return the inertias of a plant that was identified."""
     return inertias(np.stack([np.asarray(getattr(plant, n)) for n in NAMES], axis=-1), q)

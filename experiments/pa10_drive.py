@@ -31,7 +31,7 @@ SENSOR = Sensor(position_noise=1e-5, force_noise=1e-3)
 
 
 def machine(supply: float) -> Machine:
-    """The first joint with its drive, by an exact stepper."""
+    """Return the first joint with its drive, for an exact stepper."""
     stiff = ACTUAL * DECLARED
     return Machine(
         INERTIA,
@@ -48,14 +48,14 @@ def machine(supply: float) -> Machine:
 
 
 def moved(supply: float, limit: float = INPUT) -> dict[str, np.ndarray]:
-    """The joint led to and fro, harder and faster than the smaller supply allows, 20 s."""
+    """Drive the joint to and fro, harder and faster than the smaller supply allows, for 20 s."""
     return led(supply, limit, 0, 20.0, 100.0, 1.5)
 
 
 def led(
     supply: float, limit: float, seed: int, duration: float, acceleration: float, fastest: float
 ) -> dict[str, np.ndarray]:
-    """The joint led from place to place at speeds up to the fastest [rad/s]."""
+    """Move the joint from place to place at speeds up to the fastest [rad/s]."""
     rng = np.random.default_rng(seed)
     t = np.arange(round(duration * RATE)) / RATE
     points = rng.uniform(0.05, 0.4, 24) * np.where(np.arange(24) % 2, 1.0, -1.0)
@@ -65,7 +65,7 @@ def led(
 
 
 def drive(folder: Path) -> None:
-    """What the amplifier's offset and input, and the supply, do to the joint; and all of it from one log."""
+    """Show the effects of the amplifier's offset and input and of the supply; identify all from one log."""
     start = time.perf_counter()
     table = Table("Table 5.2: A_g = T_r / (10 V K_T) [A/V]", ["joint", "computed", "printed"])
     for joint, (torque, constant, printed) in RATED.items():
@@ -96,12 +96,12 @@ def drive(folder: Path) -> None:
 
 
 def log_of(run: dict[str, np.ndarray], source: str) -> Log:
-    """What a user would have of it."""
+    """Return the log of a run, with the columns of a user."""
     return Log(run["t"], run["position"], run["force"], reference=run["reference"], source=source)
 
 
 def chain(folder: Path) -> None:
-    """All of the chain from one log at the smaller supply, the inertia known.
+    """Identify the whole chain from one log at the smaller supply, with a known inertia.
 
     The amplifier's input is not told: an offset of 0.25 V exceeds it in few samples, and by 2 %. With its
     guess at 180 N m, below the truth, `output_error` ends elsewhere altogether.
@@ -134,7 +134,7 @@ def chain(folder: Path) -> None:
 
 
 def _physical(value) -> tuple[float, ...]:
-    """What the case's parameters say of amplifier and supply."""
+    """Return amplifier and supply by the parameters of the case."""
     stiff = value("actuator_gain.gain") * DECLARED
     supply = value("voltage_limit.velocity") * CONSTANT
     return (
@@ -146,7 +146,7 @@ def _physical(value) -> tuple[float, ...]:
 
 
 def hidden(folder: Path) -> None:
-    """What `discover` says of a hidden supply of 24 V, in a gentler motion; the offset is unknown.
+    """Search for a hidden supply of 24 V in a gentler motion; the offset is unknown.
 
     In the hard motion, where a fourth of the commands saturate, it fails: with the offset hidden too it names
     the limit, but beside cubic friction and with a stall torque of 2010 N m in place of 415.
@@ -170,7 +170,7 @@ def hidden(folder: Path) -> None:
 
 
 def case_of(gain: float, inertia: float | dict[str, float], effects: dict) -> str:
-    """The joint in its loop, its drive's gain declared [N m/V]."""
+    """Return the case of the joint in its loop, with the gain of its drive declared [N m/V]."""
     law = {"kind": "pd", "kp": KP, "kd": KD, "limit": INPUT}
     sensor = {"position_noise": SENSOR.position_noise, "force_noise": SENSOR.force_noise}
     return case_text(inertia, effects, actuator={"gain": gain}, controller=law, sensor=sensor)

@@ -29,7 +29,7 @@ NOISE = Sensor(position_noise=1e-5, force_noise=0.2)
 
 
 def law(situation: str, **more: float) -> Loop:
-    """What lets the joint go in one of the situations."""
+    """Return the law that lets the joint go in one of the situations."""
     coulomb, viscous = SITUATIONS[situation]
     return Loop("friction_compensation", coulomb=coulomb, viscous=viscous, **more)
 
@@ -37,7 +37,7 @@ def law(situation: str, **more: float) -> Loop:
 def released(
     situation: str, velocity: float, *, duration: float = 20.0, rate: float = FAST
 ) -> dict[str, np.ndarray]:
-    """The joint let go with a velocity and no spring."""
+    """Release the joint with a velocity and without a spring."""
     loop = replace(law(situation), reference=np.zeros(round(duration * rate)))
     return simulate(
         JOINT,
@@ -63,7 +63,7 @@ def swinging(
     step: float = 5e-5,
     **more: float,
 ) -> dict[str, np.ndarray]:
-    """The joint let go at an angle against a spring K_p."""
+    """Release the joint at an angle against a spring K_p."""
     loop = replace(law(situation, kp=kp, **more), reference=np.zeros(round(duration * rate)))
     return simulate(
         machine, loop, sensor, rate=rate, duration=duration, step=step, initial_position=start, log_rate=RATE
@@ -84,7 +84,7 @@ def settled(log: dict[str, np.ndarray]) -> tuple[float, float]:
 
 
 def unknown(guess: float, **bounds: float) -> dict[str, float]:
-    """An unknown of a case."""
+    """Return an unknown of a case."""
     return {"guess": float(guess), **bounds}
 
 
@@ -93,7 +93,7 @@ def case_text(
     effects: dict[str, dict[str, float | dict[str, float]]],
     **tables: dict[str, float | str],
 ) -> str:
-    """The case of one joint; a reference is logged where there is a controller."""
+    """Return the case of one joint; a reference is logged where there is a controller."""
 
     def entry(value: float | str | dict[str, float]) -> str:
         if isinstance(value, dict):

@@ -140,7 +140,7 @@ def workspace(
 
 
 def bars(path: Path, groups: dict[str, dict[str, np.ndarray]], label: str) -> None:
-    """A bar for each name and joint, a panel for each group (figures 5, 8, 9 and 11)."""
+    """Draw a bar for each name and joint, a panel for each group (figures 5, 8, 9 and 11)."""
     size = (4.5 * len(groups), 3.6)
     figure, axes = plt.subplots(1, len(groups), figsize=size, layout="constrained", squeeze=False)
     for ax, (group, values) in zip(axes[0], groups.items(), strict=True):

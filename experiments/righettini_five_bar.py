@@ -37,14 +37,14 @@ WARM = 0.7
 
 
 def live_of(folder: Path, name: str, law: str, **stated: object) -> jaxid.Live:
-    """The loop of a case that is written to the folder."""
+    """Return the loop of a case that is written to the folder."""
     path = folder / f"{name}.toml"
     path.write_text(robots.case_text(law, **stated))
     return jaxid.Live(path)
 
 
 def warmed(folder: Path, inertial: bool = True) -> tuple[jaxid.Live, Ran]:
-    """The adaptive law after 20 s from nothing."""
+    """Run the adaptive law for 20 s from no knowledge."""
     live = live_of(folder, "warming", ADAPTIVE, seed=9, duration=20.0, inertial=inertial)
     return live, driven(live, robot(), seed=9, inertial=inertial)
 
@@ -185,7 +185,7 @@ def convergence(folder: Path) -> None:
 
 
 def seen(ran: Ran, every: int = 20) -> tuple[np.ndarray, ...]:
-    """What a run that has learnt tells of friction, at 200 Hz from its tenth second on.
+    """Identify friction from a run of the adapted law, at 200 Hz from its tenth second on.
 
     Returns:
         Velocities; friction, from torque given and dynamics without friction; that of the model found; torque
@@ -280,7 +280,7 @@ TOLERANCE, TORQUE_NOISE = 0.05, 0.25 / robots.REDUCTION
 
 
 def tolerances(folder: Path) -> None:
-    """A thousand robots, drive gains and friction drawn, in jaxid's own simulation: how they end."""
+    """Simulate a thousand robots with drawn drive gains and friction, and show the errors at their end."""
     begin = time.perf_counter()
     true = lambda kind, k: f"{{ guess = 0.0, true = {robots.FRICTION[kind][k]} }}"
     more = (

@@ -1,4 +1,4 @@
-"""What logs of the five-bar robot tell: orders of friction, payload, what is hidden."""
+"""Identification from logs of the five-bar robot: orders of friction, payload, hidden effects."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SENSOR = f"[sensor]\nposition_resolution = {robots.COUNTS}\nforce_noise = {LOGGE
 
 
 def log_of(ran: Ran, name: str) -> Log:
-    """What an encoder and the drives would log of a run."""
+    """Return the log of a run by the encoders and drives."""
     rng = np.random.default_rng(5)
     q = np.round(ran.q / robots.COUNTS) * robots.COUNTS
     u = ran.command + LOGGED * rng.standard_normal(ran.command.shape)
@@ -28,12 +28,12 @@ def log_of(ran: Ran, name: str) -> Log:
 
 
 def case_text(**stated: object) -> str:
-    """A case of the loop that made the logs: it holds a command as long."""
+    """Return a case of the loop that made the logs, which holds a command as long."""
     return robots.case_text(PD, inertial=False, period=HELD, **stated)
 
 
 def logged(folder: Path, name: str, machine: object, seconds: float = 15.0, seed: int = 4) -> Log:
-    """A log under the PD law at 1 kHz, whose commands a log at that rate holds whole."""
+    """Return a log under the PD law at 1 kHz, whose commands a log at that rate holds whole."""
     path = folder / f"{name}.toml"
     path.write_text(case_text(friction="", gain=(1.0, 1.0), seed=seed, duration=seconds))
     live = jaxid.Live(path)
@@ -96,7 +96,7 @@ RECURSIVE = "[recursive]\nhalf_life = 600.0\ngate_velocity = 0.05\n"
 
 
 def payload(folder: Path) -> None:
-    """A mass at the tool, found while it moves: with gains of an unloaded run, and with gains free."""
+    """Identify a mass at the tool while it moves, with gains of an unloaded run and with free gains."""
     begin = time.perf_counter()
     extra = 0.8
     bare = logged(folder, "bare", robot())
@@ -122,7 +122,7 @@ def payload(folder: Path) -> None:
 
 
 def hidden(folder: Path) -> None:
-    """What `discover` names of friction on a passive joint, and of a payload."""
+    """Search for friction on a passive joint, and for a payload."""
     begin = time.perf_counter()
     stated = robots.friction_text(3)
     passive = {k: list(v) for k, v in robots.FRICTION.items()}

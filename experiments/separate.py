@@ -33,7 +33,7 @@ def scores(found) -> dict[str, float]:
 
 
 def second_log(folder: Path, proposal) -> tuple[Path, dict]:
-    """The machine run on the proposed reference."""
+    """Run the machine on the proposed reference."""
     setup, _ = curved()
     table = {"kind": "csv", "file": proposal.file, "time": "t", "column": "reference"}
     reference = make_reference(table, setup.rate, len(proposal.time) / setup.rate, folder / "first")

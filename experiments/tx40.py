@@ -53,7 +53,7 @@ SLOW = "[preprocess]\ncutoff_hz = 15.0\n\n[log]"
 
 
 def logs(folder: Path, every: int = EVERY) -> Path:
-    """The measured log, one sample in so many: two thirds to fit, and the last."""
+    """Write the measured log, decimated: two thirds to fit, and the last."""
     root = os.environ.get("JAXID_DATA")
     if not root or not (Path(root) / "tx40").is_dir():
         sys.exit("set JAXID_DATA to a folder that holds tx40/ with pos_read_data.csv, curr_data.csv")
@@ -73,7 +73,7 @@ def logs(folder: Path, every: int = EVERY) -> Path:
 
 
 def without_shaft(text: str) -> str:
-    """The case without what acts on the shaft, which stays as a place for effects."""
+    """Return the case without the effects on the shaft, which stays as a place for effects."""
     head, *effects = text.split("[[effects]]")
     last, measured = effects.pop().split("# What is logged")
     kept = [e for e in (*effects, last) if "shaft" not in e]
@@ -120,7 +120,7 @@ def models(folder: Path) -> None:
 
 
 def hidden(folder: Path) -> None:
-    """What `discover` names where the case knows the shaft but nothing that acts on it."""
+    """Search for effects where the case knows the shaft but nothing that acts on it."""
     start = time.perf_counter()
     logs(folder, every=SEARCHED)
     text = without_shaft((folder / "tx40.toml").read_text()).replace("[log]", SLOW)

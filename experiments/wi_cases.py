@@ -22,7 +22,7 @@ acceleration = [1.0, 1.6, 2.2, 1.2, 1.8, 1.4]
 def variant(
     folder: Path, name: str, *, rate: float = 1e3, friction: bool = True, poles: str | None = None
 ) -> Path:
-    """The case at another rate, without friction, or with other poles, as a file of its own."""
+    """Write the case at another rate, without friction, or with other poles, as a file by itself."""
     text = (folder / CASE).read_text()
     text = re.sub(r"period = [\d.]+", f"period = {1 / rate}", text)
     text = re.sub(r"sample_rate = [\d.]+", f"sample_rate = {rate}", text)
@@ -41,14 +41,14 @@ def one_driven(folder: Path, until: float) -> Path:
 
 
 def noisy(folder: Path, name: str, noise: float, study: str = "") -> Path:
-    """The first instants alone, with noise on the readings [m]; and what a study of it is to do."""
+    """Write the case of the first instants, with noise on the readings [m], and the study of it."""
     text = (folder / CASE).read_text().replace("duration = 10.0", f"duration = {FIRST}")
     text += f"\n[sensor]\nposition_noise = {noise:g}\n{study}"
     return _written(folder / f"{name}.toml", text)
 
 
 def undeclared(folder: Path, name: str) -> Path:
-    """The six masses to and fro, no friction declared, noise of 1 um."""
+    """Write the case of six masses to and fro without friction declared, with noise of 1 um."""
     text = _without_effects((folder / CASE).read_text())
     text = re.sub(r"\[reference\].*?(?=\[simulation\])", SWEEP, text, flags=re.S)
     path = folder / f"{name}.toml"
@@ -57,7 +57,7 @@ def undeclared(folder: Path, name: str) -> Path:
 
 
 def long_chain(folder: Path, n: int) -> Path:
-    """A chain of n masses like the six, every one driven and following."""
+    """Write the case of a chain of n masses like the six, every one driven and following."""
     many = lambda make, count: "[" + ", ".join(make(k) for k in range(count)) + "]"
     value = lambda guess, true: f"{{ guess = {guess}, true = {true} }}"
     text = f"""
@@ -90,11 +90,11 @@ sample_rate = 1000.0
 
 
 def _without_effects(text: str) -> str:
-    """The case of a chain without friction."""
+    """Return the case of a chain without friction."""
     return re.sub(r"# mu m g.*?\n\n(?=\[controller\])", "", text, flags=re.S)
 
 
 def _written(path: Path, text: str, until: float = FIRST) -> Path:
-    """A case that identifies from its first instants."""
+    """Write a case that identifies from its first instants."""
     path.write_text(text + f"\n[algebraic]\nwindow = [0.0, {until}]\n")
     return path

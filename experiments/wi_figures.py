@@ -16,7 +16,7 @@ ONSET = 0.3
 
 
 def estimates(path: Path, run: Driven, true: dict[str, float]) -> None:
-    """What was told on-line until the controller switched; thick from where it is trusted for good."""
+    """Draw the on-line estimates until the controller switched, thick from the time that all are trusted."""
     values = list(true.values())
     kinds = [k for k in KINDS if any(n.startswith(k) for n in true)]
     told = run.told[1 : (run.live.switched or len(run.told)) + 1]

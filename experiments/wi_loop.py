@@ -36,7 +36,7 @@ class Driven(NamedTuple):
 
 
 def text(**changes: str) -> str:
-    """The case, with some of its lines replaced: `poles="[-9.0, -9.0]"`."""
+    """Return the case with some of its lines replaced: `poles="[-9.0, -9.0]"`."""
     out = CASE.read_text()
     for key, value in changes.items():
         line = next(line for line in out.splitlines() if line.startswith(f"{key} = "))
@@ -45,12 +45,12 @@ def text(**changes: str) -> str:
 
 
 def true_values(case: Path = CASE) -> dict[str, float]:
-    """By name."""
+    """Return the true values by name."""
     return {f.name: f.true for f in build_machine(load_case(case)).parameters.free}
 
 
 def machine(case: Path = CASE, actuated: list[int] | None = None) -> ChainMachine:
-    """The exact simulator's machine with the case's true values."""
+    """Return the machine of the exact simulator with the true values of the case."""
     return six_masses.machine(true_values(case), actuated)
 
 
@@ -63,7 +63,7 @@ def driven(
     seed: int = 0,
     on: ChainMachine | None = None,
 ) -> Driven:
-    """The case's controller called tick by tick on the exact chain, `on` in place of the case's own.
+    """Call the controller of a case tick by tick on the exact chain, or on another one.
 
     Noise of the readings [m] goes through the loop: the controller sees what the log holds.
     """
@@ -84,7 +84,7 @@ def driven(
 
 @functools.cache
 def first_instants() -> Log:
-    """The first 0.1 s at 1 kHz, without noise."""
+    """Return the log of the first 0.1 s at 1 kHz, without noise."""
     return driven(CASE, 0.1).log
 
 

@@ -44,7 +44,7 @@ AIMS = {kind: 100 * aim for kind, aim in KINDS.items()}  # %
 
 
 def worst(found: Estimate, true: dict[str, float]) -> dict[str, tuple[float, int, int]]:
-    """Of each kind of parameter the largest error of those told [%], how many these are, and of how many."""
+    """Return by kind the largest error of identifiable parameters [%], their number, and that of all."""
     out: dict[str, tuple[float, int, int]] = {}
     for name, value, told in zip(found.names, found.theta, found.identifiable, strict=True):
         kind = re.split(r"[\[.]", name)[0]
@@ -55,7 +55,7 @@ def worst(found: Estimate, true: dict[str, float]) -> dict[str, tuple[float, int
 
 
 def words(kind: tuple[float, int, int] | None) -> str:
-    """The same as a cell of a table."""
+    """Format such an error as a cell of a table."""
     if kind is None:
         return "-"
     most, told, of = kind
@@ -63,7 +63,7 @@ def words(kind: tuple[float, int, int] | None) -> str:
 
 
 def first_instants(folder: Path) -> bool:
-    """Every form of the method on the first 0.1 s, and when its estimates lock in."""
+    """Run every form of the method on the first 0.1 s, and find when its estimates lock in."""
     begin, good = time.perf_counter(), True
     head = ["friction", "rate [Hz]", "method", *(f"{k} [%]" for k in AIMS)]
     table = Table("largest error on the first 0.1 s", head)
@@ -101,7 +101,7 @@ def first_instants(folder: Path) -> bool:
 
 
 def _locked(told: OnlineEstimate, names: list[str], true: dict[str, float], rate: float) -> list[str]:
-    """When the last parameter of each kind is within its aim for good, and all are trusted."""
+    """Return when the last parameter of each kind is within its aim for good, and all are trusted."""
     out = []
     error = 100 * np.abs(told.theta / np.array([true[n] for n in names]) - 1)
     for kind, aim in AIMS.items():
@@ -165,7 +165,7 @@ def partial(folder: Path) -> bool:
 
 
 def _head(log: jaxid.Log, until: float) -> jaxid.Log:
-    """What was known by then: the whole log would tell the filters more."""
+    """Cut a log at an instant, because the filters would use what comes later."""
     cut = log.time < until + 0.5 * log.period
     signals = {name: getattr(log, name)[cut] for name in ("time", "position", "force", "reference")}
     return replace(log, rows=(0, 0), **signals)

@@ -24,7 +24,7 @@ ALIKE = 1.4
 
 
 def noise(folder: Path, runs: int = RUNS, exact_runs: int = EXACT_RUNS) -> bool:
-    """Every form, inverse dynamics and output error against noise, by a study.
+    """Compare every form, inverse dynamics and output error against noise, by a study.
 
     The study's logs come from jaxid's own simulator. What it says of `algebraic` is held against fewer
     logs of the exact one, with noise in the loop too.
@@ -78,7 +78,7 @@ def _median(rows: list[dict], kind: str, what: str) -> float:
 
 
 def _exact(folder: Path, runs: int) -> list[dict]:
-    """As a study's rows, of `algebraic` on logs of the exact simulator.
+    """Return rows as those of a study, of `algebraic` on logs of the exact simulator.
 
     Each run is simulated anew: its noise goes through the controller and changes the motion.
     """
@@ -101,7 +101,7 @@ def _exact(folder: Path, runs: int) -> list[dict]:
 
 
 def _compared(study: list[dict], exact: list[dict]) -> bool:
-    """Whether both tell the same of `algebraic`: spreads alike, and biases within what their runs can say."""
+    """Check that both agree on `algebraic`: in spread, and in bias as far as their runs determine it."""
     head = ["noise [m]", "parameter", "spread, study", "exact", "bias, study", "exact", "its deviation"]
     table = Table("`algebraic` on logs of jaxid's own simulator (study) and of the exact one [%]", head)
     good = True

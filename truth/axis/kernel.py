@@ -16,7 +16,7 @@ OPEN, CASCADE_PD, PD, PID, COMPENSATED = 0, 1, 2, 3, 4
 
 
 class Physics(NamedTuple):
-    """What moves and what acts on it; zero (or infinity) switches a term off."""
+    """Moving body and the forces on it; zero (or infinity) switches a term off."""
 
     mass: float  # kg, added mass included
     weight: float = 0.0  # N, constant

@@ -34,7 +34,7 @@ _LAW = np.dtype([(name, _WHOLE.get(name, float)) for name in Law._fields])
 
 @dataclasses.dataclass(frozen=True)
 class ChainMachine:
-    """What moves: n masses, n + 1 springs, what drives them and what else acts.
+    """Moving part: n masses, n + 1 springs, their drives and other effects.
 
     Attributes:
         mass: Of each mass [kg].

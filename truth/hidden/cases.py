@@ -56,7 +56,7 @@ class HiddenCase:
 
     @property
     def inertia_known(self) -> bool:
-        """Whether the case gives the inertia; a gain and a mass are identifiable only then."""
+        """Check that the case gives the inertia; a gain and a mass are identifiable only then."""
         return bool({"actuator_gain", "added_mass"} & set(self.hidden))
 
     @property

@@ -27,7 +27,7 @@ DRIVES = ("actuator_gain", "actuator_lag", "input_delay", "saturation")
 
 @dataclasses.dataclass(frozen=True)
 class Sight:
-    """What shows of a hidden effect.
+    """Evidence of a hidden effect.
 
     Attributes:
         evidence: Log-likelihood beyond the best baseline [nats], by log; of the balance at the
@@ -42,7 +42,7 @@ class Sight:
 
     @property
     def visible(self) -> bool:
-        """Whether every log shows the effect."""
+        """Check that every log shows the effect."""
         return min(self.evidence) >= VISIBLE_NATS and min(self.share) >= VISIBLE_SHARE
 
 

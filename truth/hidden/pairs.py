@@ -211,7 +211,7 @@ class Pair:
 
     @property
     def visible(self) -> bool:
-        """Whether an oracle sees every difference."""
+        """Check that an oracle sees every difference."""
         return all(e >= VISIBLE_NATS and part >= VISIBLE_SHARE for e, part in self.sights().values())
 
     def _axis_rows(self):
