@@ -72,17 +72,17 @@ def replay(reference: np.ndarray, numerics: Numerics) -> Replay:
     drive = Drive(jnp.asarray([GAIN]), PERIOD, "zero_order", numerics.substeps, numerics.set_valued)
     zero = jnp.zeros((len(reference), 1))
     return Replay(
-        drive,
-        law,
-        Sensor(),
-        jnp.asarray(reference)[:, None],
-        zero,
-        None,
-        jnp.zeros(1),
-        jnp.zeros(1),
-        None,
-        1,
-        jnp.eye(1),
+        drive=drive,
+        controller=law,
+        sensor=Sensor(),
+        reference=jnp.asarray(reference)[:, None],
+        disturbance=zero,
+        command=None,
+        position=jnp.zeros(1),
+        velocity=jnp.zeros(1),
+        restart=None,
+        every=1,
+        follow=jnp.eye(1),
     )
 
 

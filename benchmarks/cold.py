@@ -110,7 +110,18 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
     def add(what: str, group: str, seconds: list[tuple[float, float, int]], of: str = commit) -> None:
         wall, processor, status = np.min(seconds, axis=0)
         load = round(os.getloadavg()[0], 1)
-        rows.append(Row(what, group, float(wall), float(processor), len(seconds), int(status), load, of))
+        rows.append(
+            Row(
+                what=what,
+                group=group,
+                wall=float(wall),
+                processor=float(processor),
+                repeats=len(seconds),
+                status=int(status),
+                load=load,
+                commit=of,
+            )
+        )
         print(line_of(rows[-1]), flush=True)
         if not options.no_write:
             write_down(kept_rows(rows) if only else rows)

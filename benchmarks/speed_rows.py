@@ -69,14 +69,14 @@ def compare(
     times = np.array([(timed(ours), timed(theirs)) for _ in range(repeats)])
     (mine, other), (fast, rival_fast) = np.median(times, axis=0), times.min(axis=0)
     row = Row(
-        quantity,
-        rival,
-        float(mine),
-        float(other),
-        float(mine / other),
-        float(fast / rival_fast),
-        difference,
-        aim,
+        quantity=quantity,
+        rival=rival,
+        jaxid=float(mine),
+        alternative=float(other),
+        ratio=float(mine / other),
+        best=float(fast / rival_fast),
+        difference=difference,
+        aim=aim,
     )
     print(line(row), flush=True)
     return row

@@ -306,15 +306,15 @@ def _drive(mujoco: Any, model: Any, k: int, names: list[str]) -> tuple[RobotDriv
         elif limited:
             lost.append(f"{what} at {title} differs by direction: it is not kept")
     return RobotDrive(
-        model.actuator(k).name or f"actuator{k + 1}",
-        names[j],
-        gain,
-        kp,
-        kd,
-        min(limits, default=None),
-        drag,
-        lag,
-        float(model.actuator_delay[k]),
+        name=model.actuator(k).name or f"actuator{k + 1}",
+        joint=names[j],
+        gain=gain,
+        kp=kp,
+        kd=kd,
+        limit=min(limits, default=None),
+        drag=drag,
+        lag=lag,
+        delay=float(model.actuator_delay[k]),
     ), lost
 
 

@@ -158,18 +158,18 @@ def explore(
         progress("simulating")
         verdict, new = "found", gaps(found.estimate.machine, session.runs)
     return Discovery(
-        session,
-        verdict,
-        None if verdict == "nothing_missing" else found.where,
-        found.effects,
-        _as_refitted([_round(search, s) for s in steps], old, new, len(session.fits)),
-        before,
-        found.estimate,
-        old,
-        new,
-        search.floor,
-        separating,
-        found.unseen,
+        session=session,
+        verdict=verdict,
+        where=None if verdict == "nothing_missing" else found.where,
+        effects=found.effects,
+        rounds=_as_refitted([_round(search, s) for s in steps], old, new, len(session.fits)),
+        before=before,
+        after=found.estimate,
+        gaps_before=old,
+        gaps_after=new,
+        noise_floor=search.floor,
+        proposals=separating,
+        unseen=found.unseen,
     )
 
 

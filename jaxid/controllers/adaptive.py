@@ -106,14 +106,14 @@ class Adaptive(FeedForward):
         start = jnp.asarray(self.estimator.recursion.start)
         information = self.regularization * square
         return Learning(
-            self.start_feedback(tick),
-            self._recursion(information).memory(),
-            information,
-            jnp.sqrt(square) / force,
-            LearnedUnknowns(start, jnp.zeros((), bool)),
-            tick.joints - back * velocity,
-            jnp.zeros((2 * self.stride, len(tick.driven))),
-            jnp.zeros((), int),
+            feedback=self.start_feedback(tick),
+            recursion=self._recursion(information).memory(),
+            information=information,
+            share=jnp.sqrt(square) / force,
+            found=LearnedUnknowns(start, jnp.zeros((), bool)),
+            positions=tick.joints - back * velocity,
+            commands=jnp.zeros((2 * self.stride, len(tick.driven))),
+            ticks=jnp.zeros((), int),
         )
 
     def law(self, tick: Tick, velocity: Array, memory: Learning, disturbance: Array) -> tuple:
@@ -169,14 +169,14 @@ class Adaptive(FeedForward):
         theta = recursion.estimate(new).theta if recursion.instrument else new.theta
         positions = jnp.concatenate([tick.joints[None], memory.positions[:-1]])
         return Learning(
-            memory.feedback,
-            new,
-            memory.information,
-            memory.share,
-            LearnedUnknowns(theta, closed),
-            positions,
-            memory.commands,
-            memory.ticks + 1,
+            feedback=memory.feedback,
+            recursion=new,
+            information=memory.information,
+            share=memory.share,
+            found=LearnedUnknowns(theta, closed),
+            positions=positions,
+            commands=memory.commands,
+            ticks=memory.ticks + 1,
         )
 
     def _converged(self, recursion: Any, memory: RecursiveMemory, share: Array) -> Array:

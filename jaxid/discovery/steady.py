@@ -104,7 +104,18 @@ def explore_steady(
     verdict = "found" if named else "unexplained" if left else "nothing_missing"
     where = None if verdict == "nothing_missing" else _where(session, baseline)
     floor = row_noise(session.machine, session.fit.log)
-    return Discovery(session, verdict, where, tuple(named), tuple(rounds), before, after, old, new, floor)
+    return Discovery(
+        session=session,
+        verdict=verdict,
+        where=where,
+        effects=tuple(named),
+        rounds=tuple(rounds),
+        before=before,
+        after=after,
+        gaps_before=old,
+        gaps_after=new,
+        noise_floor=floor,
+    )
 
 
 def _trial(session: Session, effect: Effect | None) -> _Trial:
@@ -264,4 +275,18 @@ def _where(session: Session, baseline: _Trial) -> Where:
     region = (float(v[pieces[k]].min()), float(v[pieces[k]].max()))
     unit = session.machine.unit("position/time")
     text = f"the residual is largest between {region[0]:.3g} and {region[1]:.3g} {unit}"
-    return Where(1, "velocity", region, (), text, 0.0, 0.0, 0.0, True, x, mean, mean - half, mean + half)
+    return Where(
+        joint=1,
+        variable="velocity",
+        region=region,
+        intervals=(),
+        text=text,
+        explained=0.0,
+        evidence=0.0,
+        threshold=0.0,
+        clear=True,
+        x=x,
+        mean=mean,
+        low=mean - half,
+        high=mean + half,
+    )

@@ -73,7 +73,16 @@ class HiddenJoints(Plant):
             tuple(k for k, i in enumerate(self.hidden) if i in ports) for ports in (whole.slides, whole.rises)
         )
         residual, dry, stick = (picked(a, self.hidden) for a in (whole.residual, whole.dry, whole.stick))
-        return Balance(residual, dry, stick, rising, whole.rates, whole.drive, slides, rises)
+        return Balance(
+            residual=residual,
+            dry=dry,
+            stick=stick,
+            rising=rising,
+            rates=whole.rates,
+            drive=whole.drive,
+            slides=slides,
+            rises=rises,
+        )
 
 
 def _of_joints(smoothing: Smoothing, joints: tuple[int, ...]) -> Smoothing:

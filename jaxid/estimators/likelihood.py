@@ -125,7 +125,17 @@ def likelihood_of(
         low=floors[0],
         high=np.log(np.concatenate([_MOST * force, _READING_RANGE[1] * reading])),
     )
-    return Likelihood(problem, machine, driven, numerics, applied, slow, force, noise, floors)
+    return Likelihood(
+        problem=problem,
+        machine=machine,
+        log=driven,
+        numerics=numerics,
+        applied=applied,
+        slow=slow,
+        force=force,
+        noise=noise,
+        floors=floors,
+    )
 
 
 def needed_numerics(machine: Machine, log: Log, start: np.ndarray | None) -> Numerics:

@@ -139,14 +139,14 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
     velocity = _matched(velocity, joints)
 
     return Chosen(
-        time,
-        tuple(position.values()),
-        tuple(velocity.values()),
-        tuple(force.values()),
-        tuple(reference.values()),
-        joints,
-        tuple(said),
-        questions,
+        time=time,
+        position=tuple(position.values()),
+        velocity=tuple(velocity.values()),
+        force=tuple(force.values()),
+        reference=tuple(reference.values()),
+        joints=joints,
+        said=tuple(said),
+        questions=questions,
     )
 
 

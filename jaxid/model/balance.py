@@ -76,7 +76,16 @@ def balance(
     react = _pull_back(plant, q, stacked(sums.force) + reaction)
     drive = stacked(sums.drive)
     residual = plant.inertial(q, qd, qdd) - react - plant.applied(drive, q.size)
-    return Balance(residual, levels, at_rest_only, rising, tuple(sums.rates), drive, slides, rises)
+    return Balance(
+        residual=residual,
+        dry=levels,
+        stick=at_rest_only,
+        rising=rising,
+        rates=tuple(sums.rates),
+        drive=drive,
+        slides=slides,
+        rises=rises,
+    )
 
 
 @dataclass
@@ -143,7 +152,17 @@ class _Sums:
         for e in plant.effects:
             scale[e.port] = scale[e.port] + e.dry_drift(t)
         drives = [plant.drive_of(e.port, u.size) for e in plant.effects]
-        return cls(force, dry, stick, forth, back, scale, [u[j] for j in range(u.size)], drives, [])
+        return cls(
+            force=force,
+            dry=dry,
+            stick=stick,
+            forth=forth,
+            back=back,
+            dry_scale=scale,
+            drive=[u[j] for j in range(u.size)],
+            drives=drives,
+            rates=[],
+        )
 
     def add(self, i: int, action: Action) -> None:
         """Add the action of an effect on port i."""

@@ -52,7 +52,16 @@ def parameter(
     """
     import equinox as eqx
 
-    info = ParameterInfo(dimension, sign, doc, optional, more, motion, width, known)
+    info = ParameterInfo(
+        dimension=dimension,
+        sign=sign,
+        doc=doc,
+        optional=optional,
+        more=more,
+        motion=motion,
+        width=width,
+        known=known,
+    )
     convert = _optional_array if optional else as_array
     if optional:
         return eqx.field(converter=convert, metadata={"parameter": info}, default=None)

@@ -189,7 +189,16 @@ class _Motion(NamedTuple):
         turning = _commutator(speed_matrix, speed, joint_matrix, joint)
         above = _sums(passed, turning * qd[:, None] + joint * qdd[:, None])
         above = jnp.concatenate([above[:, :3], above[:, 3:] + rise], axis=1)
-        return cls(frames, joint, joint_matrix, speed, speed_matrix, turning, above, _matrix(above))
+        return cls(
+            frames=frames,
+            joint=joint,
+            joint_matrix=joint_matrix,
+            speed=speed,
+            speed_matrix=speed_matrix,
+            turning=turning,
+            rise=above,
+            rise_matrix=_matrix(above),
+        )
 
 
 class _Loads(NamedTuple):

@@ -84,7 +84,16 @@ def open_session(
     needed = 0 if short else enough(on_log)
     fit = _open_source(source, measured, machine, recipe, needed)
 
-    opening = _Opening(as_logged, case, machine, recipe, needed, short, several, findings)
+    opening = _Opening(
+        as_logged=as_logged,
+        case=case,
+        machine=machine,
+        recipe=recipe,
+        needed=needed,
+        short=short,
+        several=several,
+        findings=findings,
+    )
     more = opening.further_logs(further, piecewise=piecewise)
     validations = opening.validations_of_case(measured)
     names = {run.name for run in (fit, *more, *validations)}

@@ -65,7 +65,18 @@ def _finite(
         gravity, normal, stiffness, damping = (x[port] for x in others)
         width = plant.port_width(q)[port]
         x = Signals(
-            y, yd, ydd, force, t, width, jnp.ones(()), gravity, normal, stiffness, damping, plant.field
+            y=y,
+            yd=yd,
+            ydd=ydd,
+            u=force,
+            t=t,
+            width=width,
+            dry_scale=jnp.ones(()),
+            gravity=gravity,
+            normal=normal,
+            stiffness=stiffness,
+            damping=damping,
+            field=plant.field,
         )
 
         def forces(leaves: list[Array]) -> tuple[list[Array], list[Array]]:

@@ -53,18 +53,18 @@ class ForceData(eqx.Module):
         """Return the arrays of a prepared log; weight one for `rows`, by default every moving sample."""
         rows = data.moving if rows is None else rows
         return cls(
-            data.q,
-            data.qd,
-            data.qdd,
-            data.force,
-            rows.astype(np.float64),
-            np.asarray(data.start),
-            data.period,
-            data.hold,
-            data.recipe.decimator,
-            data.measured,
-            data.steps,
-            not data.force.any(),
+            q=data.q,
+            qd=data.qd,
+            qdd=data.qdd,
+            force=data.force,
+            weight=rows.astype(np.float64),
+            start=np.asarray(data.start),
+            period=data.period,
+            hold=data.hold,
+            decimator=data.recipe.decimator,
+            measured=data.measured,
+            steps=data.steps,
+            passive=not data.force.any(),
         )
 
 

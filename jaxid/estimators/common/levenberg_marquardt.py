@@ -183,19 +183,19 @@ class Progress(eqx.Module):
         """
         p, xp = x.size, np if isinstance(x, np.ndarray) else jnp
         return cls(
-            x,
-            xp.asarray(0.0),
-            x,
-            xp.asarray(np.inf),
-            xp.zeros(p),
-            xp.zeros((p, p)),
-            (xp.zeros(size), xp.zeros((size, p))),
-            xp.asarray(damping),
-            xp.asarray(2.0),
-            scale,
-            xp.asarray(0.0),
-            xp.asarray(0),
-            xp.asarray(False),
+            trial=x,
+            predicted=xp.asarray(0.0),
+            x=x,
+            cost=xp.asarray(np.inf),
+            gradient=xp.zeros(p),
+            normal=xp.zeros((p, p)),
+            kept=(xp.zeros(size), xp.zeros((size, p))),
+            damping=xp.asarray(damping),
+            growth=xp.asarray(2.0),
+            scale=scale,
+            nothing=xp.asarray(0.0),
+            steps=xp.asarray(0),
+            done=xp.asarray(False),
         )
 
     def minimum(self, transform: Transform) -> Minimum:
@@ -495,20 +495,20 @@ def advanced_by_model(
     stuck = rough | (~better & (damping > 1e12))
     growth = jnp.where(better, 2.0, 2 * p.growth)
     return Progress(
-        trial,
-        predicted,
-        x,
-        cost,
-        gradient,
-        normal,
-        kept,
-        damping,
-        growth,
-        p.scale,
-        nothing,
-        p.steps + 1,
-        small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / size * cost),
-        aux,
+        trial=trial,
+        predicted=predicted,
+        x=x,
+        cost=cost,
+        gradient=gradient,
+        normal=normal,
+        kept=kept,
+        damping=damping,
+        growth=growth,
+        scale=p.scale,
+        nothing=nothing,
+        steps=p.steps + 1,
+        done=small | stuck | ~jnp.isfinite(cost) | (cost - floor <= _SURE / size * cost),
+        aux=aux,
     )
 
 

@@ -171,7 +171,16 @@ def _solved_steps(
             parameters.bounds,
         ),
     )
-    return _Solved(data, weights, fit, minimum, np.asarray(chi), np.asarray(slopes), recipe, notes)
+    return _Solved(
+        data=data,
+        weights=weights,
+        fit=fit,
+        minimum=minimum,
+        chi=np.asarray(chi),
+        slopes=np.asarray(slopes),
+        recipe=recipe,
+        notes=notes,
+    )
 
 
 def filtering_of(session: Session, printed: bool = False) -> tuple[Spectrum, Recipe, tuple[str, ...]]:
