@@ -70,29 +70,16 @@ def study(
     """
     case = load_case(case)
     where = None if folder is None else Path(folder)
-    if resume and where is None:
-        raise InputError("there is nothing to resume from", hint="give the folder of the study: -o DIR")
-    if where is not None and not resume:
-        check_folder(where, FILES, overwrite=overwrite)
-        if (where / _MANIFEST).exists():
-            raise InputError(
-                "holds a study already",
-                where=str(where),
-                hint="continue it with --resume, or choose another -o",
-            )
+    _need_folder(where, resume=resume, overwrite=overwrite)
     begun = _begun(where) if resume and where is not None else {}
     with contextlib.ExitStack() as stack:
         remote = None if scheduler is None else stack.enter_context(Remote(scheduler))
         plan = Plan.of(case, runs=runs, seed=seed, workers=remote and remote.threads)
         # The number of runs solved together changes the last bits, so that of the first start is kept.
         plan = replace(plan, chunk=int(begun.get("chunk", plan.chunk)))
-        differs = same(plan.manifest, begun) if resume else ""
-        if differs:
-            raise InputError(
-                f"holds another study: {differs} differ",
-                where=str(where),
-                hint="resume with the same case and options, or choose another -o",
-            )
+        if resume:
+            _need_same_study(plan, begun, where)
+
         # Every refusal comes before the first write.
         runner = Runner(plan)
         for level in range(len(plan.levels)):
@@ -105,6 +92,7 @@ def study(
         bound = np.stack([_bound(plan, level) for level in plan.levels])
         identity = digest_of(plan.manifest)
         kept = _kept(where, plan, identity) if resume and where is not None else {}
+
         if where is not None and not resume:
             _begin(where, plan)
         missing = [k for k in range(len(plan.chunks)) if k not in kept]
@@ -116,10 +104,39 @@ def study(
                 write_whole(_path(where, number), _packed(arrays, identity))
             done += len(plan.chunks[number][1])
             progress(done, total)
+
     result = gathered(plan, [kept[k] for k in range(len(plan.chunks))], bound)
     if where is not None:
         result.save(where, overwrite=overwrite)
     return result
+
+
+def _need_folder(where: Path | None, *, resume: bool, overwrite: bool) -> None:
+    """Refuse a folder that holds a study already, or no folder to resume from."""
+    if resume:
+        if where is None:
+            raise InputError("there is nothing to resume from", hint="give the folder of the study: -o DIR")
+        return
+    if where is None:
+        return
+    check_folder(where, FILES, overwrite=overwrite)
+    if (where / _MANIFEST).exists():
+        raise InputError(
+            "holds a study already",
+            where=str(where),
+            hint="continue it with --resume, or choose another -o",
+        )
+
+
+def _need_same_study(plan: Plan, begun: dict, where: Path | None) -> None:
+    """Refuse to resume a study of another case or with other options."""
+    differs = same(plan.manifest, begun)
+    if differs:
+        raise InputError(
+            f"holds another study: {differs} differ",
+            where=str(where),
+            hint="resume with the same case and options, or choose another -o",
+        )
 
 
 def _solved(runner: Runner, numbers: list[int]) -> Iterator[tuple[int, Arrays]]:
