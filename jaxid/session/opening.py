@@ -61,12 +61,7 @@ def open_session(
         return open_steady(as_logged, one_table(as_logged, log), validate, read_at_joints)
     case = at_joints(as_logged)
 
-    source, *further = sources_of(as_logged, log)
-    measured = read_at_joints(as_logged, source.log, columns=source.columns)
-    if piecewise:
-        source, *between = between_gaps(source, measured)
-        further = [*between, *further]
-
+    source, measured, further = _first_log(as_logged, log, piecewise=piecewise)
     # The machine of the first log serves them all: only the controller's period depends on the log.
     machine = build_machine(case, period=measured.period)
     several = bool(further or case.fits)
@@ -111,6 +106,16 @@ def open_session(
         return session
     chooses_hold = not isinstance(source.log, Log) and "hold" not in case.tables.get("log", {})
     return _held_against_case(session, several=several, chooses_hold=chooses_hold)
+
+
+def _first_log(case: Case, log: Logs, *, piecewise: bool) -> tuple[Source, Log, list[Source]]:
+    """Read the first log to fit; return its source, the log at the joints, and the sources of the others."""
+    source, *further = sources_of(case, log)
+    measured = read_at_joints(case, source.log, columns=source.columns)
+    if piecewise:
+        source, *between = between_gaps(source, measured)
+        further = [*between, *further]
+    return source, measured, further
 
 
 @dataclass(frozen=True)
