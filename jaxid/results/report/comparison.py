@@ -51,13 +51,13 @@ def comparison_report(result: Comparison) -> str:
         values=value_rows(result),
         figure=image(plot_values(result), "Values by log") if _parameters(result) else None,
         evidence=[
-            {
-                "label": d.label,
-                "evidence": nats(d.evidence),
-                "threshold": nats(d.threshold),
-                "false_alarm": f"below {_NEVER:.0e}" if d.false_alarm < _NEVER else f"{d.false_alarm:.1e}",
-                "alternatives": ", ".join(rival_words(r) for r in d.alternatives) or "none",
-            }
+            (
+                d.label,
+                nats(d.evidence),
+                nats(d.threshold),
+                f"below {_NEVER:.0e}" if d.false_alarm < _NEVER else f"{d.false_alarm:.1e}",
+                ", ".join(rival_words(r) for r in d.alternatives) or "none",
+            )
             for d in result.differences
         ],
         tried=result.tried,
