@@ -42,9 +42,9 @@ def need_known_numerics(args: argparse.Namespace) -> None:
     need_known("minimiser", args.minimiser, MINIMISERS)
 
 
-def need_at_least(least: int, option: str, value: int) -> None:
-    """Refuse a number below the least, which is 0 or 1."""
-    if value < least:
+def need_at_least(least: int, option: str, value: int | None) -> None:
+    """Refuse a number below the least, which is 0 or 1; None is accepted."""
+    if value is not None and value < least:
         raise InputError(f"{option} is {value}", hint=f"give {('zero', 'one')[least]} or more")
 
 
