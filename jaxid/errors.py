@@ -5,6 +5,8 @@ from collections.abc import Iterable
 
 # Most characters of a name that a hint lists.
 _LONGEST = 40
+# Most characters that an error repeats of what a library says.
+_LONGEST_CAUSE = 200
 
 
 class InputError(ValueError):
@@ -50,3 +52,11 @@ def suggest(name: str, known: Iterable[str], *, limit: int = 12) -> str:
     listed = ", ".join(short) + (", ..." if len(names) > limit else "")
     question = f"did you mean '{folded[near[0]]}'? " if near else ""
     return f"{question}there is: {listed}"
+
+
+def cause(error: BaseException) -> str:
+    """Return what a library says of an error in one line of at most 200 characters, or the error's name."""
+    words = " ".join(str(error).split())
+    if len(words) > _LONGEST_CAUSE:
+        words = words[: _LONGEST_CAUSE - 4] + " ..."
+    return words or type(error).__name__

@@ -14,7 +14,7 @@ import pytest
 
 import jaxid
 from jaxid.cli import main
-from jaxid.errors import InputError
+from jaxid.errors import InputError, cause
 from jaxid.experiment_design.along_reference import Excitation
 from jaxid.experiment_design.in_loop import Design
 from jaxid.files import write_results, write_together, write_whole
@@ -285,3 +285,9 @@ def test_refused_before_the_work(results, tmp_path, capsys):
     argv = ("identify", case, case.parent / "log.csv", "-o", tmp_path / "file" / "out")
     refused(capsys, tmp_path, *argv, told="is a file, not a folder")
     assert np.isfinite(results["identify"].parameters["inertia"].value)
+
+
+def test_an_error_repeats_no_more_than_a_line_of_a_library():
+    assert cause(ValueError("a\nb")) == "a b"
+    assert cause(KeyError()) == "KeyError"
+    assert len(cause(ValueError("x" * 5000))) == 200

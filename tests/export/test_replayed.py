@@ -162,8 +162,11 @@ def test_a_urdf_is_replayed_too(tmp_path):
     file = export(result, "urdf")
     assert len(file.changed) == 2
     found = check_export(result, "urdf", file, tmp_path / "log.csv")
-    # Euler's velocities are half a step ahead of the differences of positions from which runs start anew.
-    assert np.all(found.after < 0.05 * found.before)
+    # Euler's velocities are half a step ahead of the differences of positions from which runs start anew:
+    # that is left beside the stated cost of the time step.
+    costs = dict(found.costs)
+    (time_step,) = (cost for what, cost in costs.items() if what.startswith("time step"))
+    assert np.all(found.after < 0.03 * found.before + time_step)
 
 
 def with_covariance(result, std):

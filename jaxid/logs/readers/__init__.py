@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from jaxid.errors import InputError, suggest
+from jaxid.errors import InputError, cause, suggest
 from jaxid.logs.readers.array_files import read_mat, read_npz, read_parquet
 from jaxid.logs.readers.csv_file import read_csv
 from jaxid.logs.readers.excel_file import read_excel
@@ -124,7 +124,7 @@ def read_table(
         return read if isinstance(read, Table) else Table(*read)
     except OSError as error:
         hint = "check the permissions of the file"
-        raise InputError(f"cannot be read ({error})", where=str(path), hint=hint) from error
+        raise InputError(f"cannot be read ({cause(error)})", where=str(path), hint=hint) from error
     except MemoryError as error:
         hint = "cut or decimate the log"
         raise InputError("is too large for the memory", where=str(path), hint=hint) from error

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.lib import format as npy
 
-from jaxid.errors import InputError, suggest
+from jaxid.errors import InputError, cause, suggest
 from jaxid.logs.readers.extras import need
 from jaxid.logs.readers.mat_file import MatFile
 from jaxid.logs.readers.rows import Rows, resolve_rows
@@ -42,7 +42,7 @@ def read_npz(path: Path, names: list[str], rows: Rows | None) -> Columns:
     except Exception as error:
         # A damaged archive raises errors of a dozen kinds, down to those of zlib and struct.
         hint = "save arrays of numbers with numpy.savez(path, t=t, q=q, u=u)"
-        raise InputError(f"cannot be read ({_said(error)})", where=str(path), hint=hint) from error
+        raise InputError(f"cannot be read ({cause(error)})", where=str(path), hint=hint) from error
     return pick_columns(path, known, names, rows)
 
 
@@ -73,10 +73,6 @@ def need_size(size: float, where: str) -> None:
         raise InputError(what, where=where, hint=f"at most {_LARGEST / 2**30:g} GiB: cut or decimate the log")
 
 
-def _said(error: BaseException) -> str:
-    return str(error) or type(error).__name__
-
-
 def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns | Table:
     """Read columns of a MATLAB file; see `read_columns`. One of version 7.3 needs h5py."""
     hint = "is it a MATLAB file? save it again with -v7"
@@ -95,7 +91,7 @@ def read_mat(path: Path, names: list[str], rows: Rows | None) -> Columns | Table
         raise
     except Exception as error:
         # A damaged file raises errors of a dozen kinds.
-        raise InputError(f"cannot be read ({_said(error)})", where=str(path), hint=hint) from error
+        raise InputError(f"cannot be read ({cause(error)})", where=str(path), hint=hint) from error
     return pick_columns(path, known, names, rows)
 
 
@@ -140,7 +136,7 @@ def read_parquet(path: Path, names: list[str], rows: Rows | None) -> Columns:
         raise
     except (pyarrow.ArrowException, ValueError, KeyError, TypeError) as error:
         hint = "is it a Parquet file? export it again"
-        raise InputError(f"cannot be read ({_said(error)})", where=str(path), hint=hint) from error
+        raise InputError(f"cannot be read ({cause(error)})", where=str(path), hint=hint) from error
     return pick_columns(path, known, names, rows)
 
 
@@ -180,7 +176,7 @@ def _asarray(values: Any, where: str) -> np.ndarray:
         return np.asarray(values)
     except Exception as error:
         hint = "give a plain array of real numbers"
-        raise InputError(f"is no array ({_said(error)})", where=where, hint=hint) from error
+        raise InputError(f"is no array ({cause(error)})", where=where, hint=hint) from error
 
 
 def _seconds(values: np.ndarray) -> np.ndarray:

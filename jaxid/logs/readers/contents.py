@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.errors import InputError
+from jaxid.errors import InputError, cause
 from jaxid.logs.readers import READERS, reader_of
 from jaxid.logs.readers.csv_file import dialect_of, read_csv
 from jaxid.logs.readers.dialect import Dialect, bare, cells_of, split_unit
@@ -229,7 +229,7 @@ def _of_ros(path: Path) -> Contents:
     except (InputError, OSError):
         raise
     except Exception as error:
-        what = f"cannot be read ({str(error) or type(error).__name__})"
+        what = f"cannot be read ({cause(error)})"
         hint = "is it a ROS recording? `ros2 bag info` shows"
         raise InputError(what, where=str(path), hint=hint) from error
     return Contents(tuple(names), {}, HEADER)

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from jaxid.errors import InputError
+from jaxid.errors import InputError, cause
 from jaxid.logs.readers.dialect import (
     GROUPS,
     SHOWN,
@@ -44,7 +44,9 @@ def read_csv(path: Path, names: list[str], rows: Rows | None, settings: LogTable
     try:
         return _Reading(path, names, settings).table(rows)
     except csv.Error as error:
-        raise InputError(f"cannot be read ({error})", where=str(path), hint="export the log again") from error
+        raise InputError(
+            f"cannot be read ({cause(error)})", where=str(path), hint="export the log again"
+        ) from error
 
 
 def dialect_of(path: Path, names: list[str]) -> tuple[Dialect, list[str]]:

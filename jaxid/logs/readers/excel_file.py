@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.errors import InputError, suggest
+from jaxid.errors import InputError, cause, suggest
 from jaxid.logs.readers.dialect import split_unit
 from jaxid.logs.readers.extras import need
 from jaxid.logs.readers.rows import Rows, resolve_rows
@@ -43,7 +43,7 @@ def _opened(path: Path) -> Iterator[Any]:
         raise
     except Exception as error:
         # A damaged archive raises errors of many kinds, also while its rows are read.
-        what = f"cannot be read ({str(error) or type(error).__name__})"
+        what = f"cannot be read ({cause(error)})"
         raise InputError(what, where=str(path), hint="is it an .xlsx file? save it again") from error
     finally:
         if book is not None:

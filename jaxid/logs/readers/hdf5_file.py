@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.errors import InputError
+from jaxid.errors import InputError, cause
 from jaxid.logs.readers.array_files import base_of, need_size, pick_columns
 from jaxid.logs.readers.extras import need
 from jaxid.logs.readers.rows import Rows
@@ -78,7 +78,7 @@ def _opened(path: Path, h5py: Any) -> Iterator[Any]:
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         if isinstance(error, OSError) and error.errno:
             raise
-        what = f"cannot be read ({error or type(error).__name__})"
+        what = f"cannot be read ({cause(error)})"
         raise InputError(what, where=str(path), hint="is it an HDF5 file? export it again") from error
 
 

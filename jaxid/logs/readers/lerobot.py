@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.errors import InputError, suggest
+from jaxid.errors import InputError, cause, suggest
 from jaxid.logs.readers.array_files import pick_columns
 from jaxid.logs.readers.extras import need
 from jaxid.logs.readers.rows import Rows
@@ -74,7 +74,7 @@ def read_lerobot(path: Path, names: list[str], rows: Rows | None, settings: LogT
     except (InputError, OSError):
         raise
     except Exception as error:
-        what = f"cannot be read ({str(error) or type(error).__name__})"
+        what = f"cannot be read ({cause(error)})"
         raise InputError(what, where=str(path), hint="is it a LeRobot dataset? download it again") from error
 
     arrays = {

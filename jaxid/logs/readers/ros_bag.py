@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.errors import InputError, suggest
+from jaxid.errors import InputError, cause, suggest
 from jaxid.logs.readers.array_files import pick_columns
 from jaxid.logs.readers.extras import need
 from jaxid.logs.readers.rows import Rows
@@ -85,7 +85,7 @@ def read_ros(path: Path, names: list[str], rows: Rows | None) -> Table:
         raise
     except Exception as error:
         # A damaged recording raises errors of a dozen kinds, down to those of SQLite and of the compression.
-        what = f"cannot be read ({str(error) or type(error).__name__})"
+        what = f"cannot be read ({cause(error)})"
         raise InputError(
             what, where=str(path), hint="is it a ROS recording? `ros2 bag info` shows"
         ) from error

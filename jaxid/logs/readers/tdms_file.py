@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.errors import InputError, suggest
+from jaxid.errors import InputError, cause, suggest
 from jaxid.logs.readers.array_files import need_size, pick_columns
 from jaxid.logs.readers.extras import need
 from jaxid.logs.readers.rows import Rows
@@ -41,7 +41,7 @@ def read_tdms(path: Path, names: list[str], rows: Rows | None) -> Table:
         raise
     except Exception as error:
         # A damaged file raises errors of many kinds.
-        what = f"cannot be read ({str(error) or type(error).__name__})"
+        what = f"cannot be read ({cause(error)})"
         raise InputError(what, where=str(path), hint="is it a TDMS file? export it again") from error
 
     values = {name: _seconds(v) for name, v in values.items()}
