@@ -18,7 +18,7 @@ from jaxid.errors import InputError
 from jaxid.estimators import need_consistent, need_likelihood
 from jaxid.machine import Machine
 from jaxid.names import DISCOVER, IN_LOOP, SEVERAL_LOGS, USER_METHODS
-from jaxid.numerics.lanes import cores
+from jaxid.numerics.lanes import accelerator, cores
 from jaxid.scene import Scene
 from jaxid.studies.levels import Level, levels_of
 
@@ -35,6 +35,9 @@ _UNSTATED = 2**32
 _LAYOUT = 3
 # Deviations of a drawn delay that a simulation's memory of past commands allows for.
 _FARTHEST = 5.0
+
+# True values of a run, the start of its fit, and the generator of its noise.
+Draw = tuple[np.ndarray, np.ndarray, np.random.Generator]
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,7 @@ class Plan:
             for level in range(len(self.levels)) for first in starts
         ]  # fmt: skip
 
-    def drawn(self, run: int) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
+    def drawn(self, run: int) -> Draw:
         """Draw the true values of a run, the start of its fit, and the generator of its noise.
 
         They depend on the seed and the run's number alone, so that every level has the same draws.
@@ -223,11 +226,6 @@ def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
     most = _RUNS_OF_DEVICE if accelerator() else max(_LARGEST, _SAMPLES // samples)
     shared = -(-runs // workers)
     return int(np.clip(_MEMORY * _memory() / workers / each, 1, min(most, shared)))
-
-
-def accelerator() -> bool:
-    """Return whether JAX has an accelerator, which one chunk then fills."""
-    return jax.local_devices()[0].platform != "cpu"
 
 
 def _memory() -> float:

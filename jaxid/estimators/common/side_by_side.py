@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Progress, Transform, advanced_by_model
+from jaxid.numerics.lanes import unrolled
 
 # Evaluations of a fit, at most; those that take more are for `levenberg_marquardt`.
 _MAX_EVALUATIONS = 30
@@ -120,5 +121,5 @@ def _sums(
 
     fits = e.shape[1]
     zero = (jnp.zeros(fits), jnp.zeros((p, fits)), jnp.zeros((p, p, fits)))
-    (cost, gradient, gram), _ = jax.lax.scan(add, zero, (e, jacobian))
+    (cost, gradient, gram), _ = jax.lax.scan(add, zero, (e, jacobian), unroll=unrolled(len(e)))
     return cost, gradient.T, jnp.moveaxis(gram, -1, 0)
