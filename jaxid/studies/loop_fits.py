@@ -6,9 +6,11 @@ for the nominal log. A run that would decide otherwise is left to the estimators
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import jax
@@ -158,6 +160,7 @@ class LoopFits:
     plan: Plan
     machine: Machine
     level: _Level
+    _device: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
     def of(cls, plan: Plan, level: Level, session: Session, numerics: Numerics | None) -> LoopFits | None:
@@ -219,8 +222,10 @@ class LoopFits:
         filled = [*range(len(drawn)), *[len(drawn) - 1] * (lanes - len(drawn))]
         truth, start = (np.stack([drawn[k][part] for k in filled]) for part in (0, 1))
         bounds = self.machine.parameters.bounds_at(start)
-        noise = (x[filled] for x in self._noise(drawn))
-        found: _Found = jax.tree.map(np.asarray, _program(self.level, truth, start, bounds, *noise))
+        noise = self._noise(drawn, lanes)
+        # An accelerator has memory for one chunk; on a processor each thread has its own.
+        with self._device if accelerator() else contextlib.nullcontext():
+            found: _Found = jax.tree.map(np.asarray, _program(self.level, truth, start, bounds, *noise))
         found = jax.tree.map(lambda x: x[: len(drawn)], found)
         std, known = deviations(found.gram, found.meat, found.signal, _scale(found.theta))
         identifiable = np.ones(std.shape, bool)
@@ -232,12 +237,13 @@ class LoopFits:
         columns = converged(found.theta, std, identifiable, found.steps)
         return good, columns | {"tracking": found.tracking[None]}
 
-    def _noise(self, drawn: Sequence[Draw]) -> tuple[np.ndarray, np.ndarray]:
+    def _noise(self, drawn: Sequence[Draw], lanes: int) -> tuple[np.ndarray, np.ndarray]:
         """Draw the noise of readings and logged commands, as `Scene.simulated_log` does."""
         level, ticks = self.level, len(self.level.signal)
-        of_readings = np.empty((len(drawn), ticks, len(level.position)))
-        logged = level.sensor.force_noise is not None
-        of_command = np.zeros((len(drawn), len(range(0, ticks, level.replay.every)), level.gain.size))
+        rows, logged = len(range(0, ticks, level.replay.every)), level.sensor.force_noise is not None
+        make = np.empty if len(drawn) == lanes and logged else np.zeros
+        of_readings = make((lanes, ticks, len(level.position)))
+        of_command = make((lanes, rows, level.gain.size))
 
         def draw(k: int) -> None:
             rng = drawn[k][2]

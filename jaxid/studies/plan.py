@@ -72,7 +72,7 @@ class Plan:
             case: The case; its [study] may be left out.
             runs: Number of runs at each level; None: that of the case.
             seed: Seed of everything that is drawn, from 0 to 2^31 - 1.
-            workers: Number of chunks that run at once; None: one a core, or one on an accelerator.
+            workers: Number of chunks that run at once; None: see `at_once`.
 
         Raises:
             InputError: If the case cannot be simulated, no parameter is unknown, the case states no noise
@@ -160,15 +160,18 @@ class Plan:
         They depend on the seed and the run's number alone, so that every level has the same draws.
         """
         rng = np.random.default_rng([self.seed, run])
-        truth = self.scene.machine.parameters.guess
-        truth = truth * np.exp(self.draw * rng.standard_normal(len(truth)))
-        # A fit must be able to reach it.
-        truth = np.clip(truth, *self.scene.machine.parameters.bounds)
-        start = rng.standard_normal(len(self.names))
-        guess = self.machine.parameters.guess
-        lower, upper = self.machine.parameters.bounds
-        started = np.clip(guess * np.exp(self.start_spread * start), lower, upper)
+        true, guess = self._centres
+        # A fit must be able to reach the true values.
+        truth = _about(*true, self.draw * rng.standard_normal(len(true[0])))
+        started = _about(*guess, self.start_spread * rng.standard_normal(len(self.names)))
         return truth, started, rng
+
+    @functools.cached_property
+    def _centres(self) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Value, lower and upper bound of each parameter of the simulated machine, and of the model."""
+        both = (self.scene.machine.parameters, self.machine.parameters)
+        true, guess = ((p.guess, *p.bounds) for p in both)
+        return true, guess
 
     @property
     def manifest(self) -> dict:
@@ -191,6 +194,11 @@ class Plan:
             "layout": _LAYOUT,
             "versions": {p: version(p) for p in packages},
         }
+
+
+def _about(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return values changed by factors exp(change), within bounds."""
+    return np.minimum(np.maximum(value * np.exp(change), lower), upper)
 
 
 def _need_learner(case: Case, scene: Scene) -> None:
@@ -217,14 +225,15 @@ def _without(case: Case, hidden: tuple[str, ...]) -> Case:
 
 
 def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
-    """Return the number of runs that are solved together: as many as memory holds for all workers."""
+    """Return the number of runs that are solved together: as many as the memory holds."""
     machine, joints = levels[0].machine, levels[0].model.plant.joints
     samples = max(len(level.scene.signal) for level in levels)
     refined = 8 if machine.controller is None and machine.hold == "band_limited" else 1
     # Residual, Jacobian and trajectory, kept twice over by the solver.
     each = 8 * samples * refined * joints * 2 * (len(machine.parameters.free) + 10)
-    most = _RUNS_OF_DEVICE if accelerator() else max(_LARGEST, _SAMPLES // samples)
-    shared = -(-runs // workers)
+    if accelerator():
+        return int(np.clip(_MEMORY * _memory() / each, 1, min(_RUNS_OF_DEVICE, runs)))
+    most, shared = max(_LARGEST, _SAMPLES // samples), -(-runs // workers)
     return int(np.clip(_MEMORY * _memory() / workers / each, 1, min(most, shared)))
 
 
@@ -237,8 +246,8 @@ def _memory() -> float:
 
 
 def at_once() -> int:
-    """Return the number of chunks in work at once: one a core, or one on an accelerator."""
-    return 1 if accelerator() else cores()
+    """Return the number of chunks in work at once: one a core, or one computed and one drawn."""
+    return 2 if accelerator() else cores()
 
 
 def fingerprint(case: Case) -> str:
