@@ -53,7 +53,7 @@ _HEAD = 64
 
 
 class _Level(eqx.Module):
-    """What the runs of a level have in common.
+    """Everything that the runs of a level have in common.
 
     Args:
         plant, places: The simulated plant, and the places of its unknowns.
@@ -126,7 +126,7 @@ class _Level(eqx.Module):
 
 
 class _Found(eqx.Module):
-    """What the program finds of each run.
+    """Results of the program, by run.
 
     Args:
         theta, steps: Estimates and numbers of evaluations, (runs, p) and (runs,).
@@ -154,7 +154,7 @@ class LoopFits:
     Args:
         plan: The study.
         machine: The machine of the model, at the guesses.
-        level: What the runs have in common.
+        level: Everything that the runs have in common.
     """
 
     plan: Plan
@@ -215,7 +215,7 @@ class LoopFits:
         lanes = self.plan.chunk if accelerator() else min(self.plan.chunk, _LANES)
         parts = [self._fitted(drawn[first : first + lanes], lanes) for first in range(0, len(drawn), lanes)]
         done = np.concatenate([done for done, _ in parts])
-        return done, {n: np.concatenate([own[n] for _, own in parts], axis=1) for n in parts[0][1]}
+        return done, {n: np.concatenate([columns[n] for _, columns in parts], axis=1) for n in parts[0][1]}
 
     def _fitted(self, drawn: Sequence[Draw], lanes: int) -> tuple[np.ndarray, Arrays]:
         """Fit the runs of one call; fewer than its lanes are filled up, so that one shape serves all."""
@@ -232,8 +232,8 @@ class LoopFits:
         good = found.good & _identified(start[: len(drawn)], *found.balance)
         for k in np.flatnonzero(good & ~known):
             sums = found.gram[k], found.meat[k], float(found.signal[k]), _scale(found.theta[k])
-            own = assess_from_sums(self.machine.parameters.names, *sums)
-            std[k], identifiable[k] = own.std, own.identifiable
+            precision = assess_from_sums(self.machine.parameters.names, *sums)
+            std[k], identifiable[k] = precision.std, precision.identifiable
         columns = converged(found.theta, std, identifiable, found.steps)
         return good, columns | {"tracking": found.tracking[None]}
 

@@ -96,8 +96,8 @@ class Runner:
             found = run_batched([self._run(level, runs[k], ways) for k in left], self.plan.lanes)
             # An exception ends its run only, even one of a library.
             rows = [self._all_failed(x) if isinstance(x, Exception) else x for x in found]
-            own = {name: np.stack([row[name] for row in rows], axis=1) for name in (*COLUMNS, "tracking")}
-            out = own if out is None else _merged(out, own, left)
+            alone = {name: np.stack([row[name] for row in rows], axis=1) for name in (*COLUMNS, "tracking")}
+            out = alone if out is None else _merged(out, alone, left)
         assert out is not None, "a chunk has runs"
         out["truth"] = np.stack([truth[self.plan.own] for truth, _, _ in drawn])
         out["start"] = np.stack([start for _, start, _ in drawn])
@@ -225,11 +225,11 @@ def _words(error: Exception) -> str:
     return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
 
 
-def _merged(out: Arrays, own: Arrays, places: np.ndarray) -> Arrays:
-    """Return the arrays of a chunk with those of some of its runs in their places."""
-    order = np.arange(out["steps"].shape[1])
+def _merged(together: Arrays, alone: Arrays, places: np.ndarray) -> Arrays:
+    """Return the arrays of a chunk, those of the runs at some places replaced by others."""
+    order = np.arange(together["steps"].shape[1])
     order[places] = len(order) + np.arange(len(places))
-    return {name: np.concatenate([out[name], own[name]], axis=1)[:, order] for name in own}
+    return {name: np.concatenate([together[name], alone[name]], axis=1)[:, order] for name in alone}
 
 
 def _run_arrays(rows: list[RunRow], tracking: np.ndarray) -> Arrays:

@@ -287,7 +287,7 @@ def test_results_tell_the_median_and_the_parabola(tmp_path, axis):
 
 @pytest.mark.parametrize("speed", [0.1, 10.0, 20.0])
 def test_compiled_counts_are_those_of_a_log_with_the_same_reach(speed):
-    """Where a reach around stops and reversals is known; another reach is told from it."""
+    """A known reach around stops and reversals gives the same samples; another reach is noticed."""
     recipe = Recipe(60.0, 4, 5, 3, (0.3,), True, "spectral", edge=0.15)
     v = np.sin(speed * 0.01 * np.arange(3000.0))[:, None]
     reach = reach_around(v, recipe)
