@@ -124,7 +124,7 @@ class Parameters:
         stated = [(f.lower, f.upper, *floors.get(f.sign, (0.0, _POSITIVE_FLOOR))) for f in self.free]
         lower, upper, floor, part = np.asarray(stated, dtype=np.float64).reshape(-1, 4).T
         lowest = np.maximum(lower, floor + part * np.abs(guess))
-        return lowest, np.broadcast_to(upper, lowest.shape)
+        return lowest, upper + np.zeros_like(lowest)
 
     def insert(self, plant: Plant, theta: Float[Array, " p"]) -> Plant:
         """Return the plant with the unknowns set."""

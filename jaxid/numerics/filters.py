@@ -145,7 +145,7 @@ def spectral_derivatives(
     Returns:
         The band-limited signal and its derivatives of order 1 to `orders`, each (time, k).
     """
-    return tuple(y.T for y in spectral_rows(np.ascontiguousarray(x.T), period, cutoff_hz, orders))
+    return tuple(np.asarray(y.T) for y in spectral_rows(np.ascontiguousarray(x.T), period, cutoff_hz, orders))
 
 
 def spectral_rows(
@@ -351,7 +351,7 @@ def high_band_std(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
     It is the median of the periodogram between 0.6 and 0.95 of the Nyquist frequency, over the median of
     an exponential distribution: spectral lines and a few bad frequencies do not change it.
     """
-    return high_band_std_of_rows(np.ascontiguousarray(x.T))
+    return np.asarray(high_band_std_of_rows(np.ascontiguousarray(x.T)))
 
 
 def high_band_std_of_rows(x: Float[Array, "k time"]) -> Float[Array, " k"]:

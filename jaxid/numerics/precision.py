@@ -75,7 +75,7 @@ class NoiseModel:
         whole = len(e) - np.arange(largest + 1.0)
         pairs = whole if counts.all() else np.maximum(_lagged(counts.astype(float), largest), 1.0)
         coefficients, order, innovation = _by_yule_walker((_lagged(e, largest) / pairs)[None], samples)
-        return cls(coefficients[0, : order[0]], float(innovation[0]))
+        return cls(np.asarray(coefficients[0, : order[0]]), float(innovation[0]))
 
     @classmethod
     def of_density(cls, power: Float[np.ndarray, " f"], rate_hz: float, order: int) -> NoiseModel:
@@ -197,7 +197,7 @@ def sandwich(jacobian: Float[np.ndarray, "time p"], noise: NoiseModel) -> Float[
         return noise.innovation**2 * (jacobian.T @ jacobian)
     # By rows, of which the transforms are faster.
     rows = np.ascontiguousarray(jacobian.T)[None]
-    return sandwiches(rows, noise.coefficients[None], np.array([noise.innovation]))[0]
+    return np.asarray(sandwiches(rows, noise.coefficients[None], np.array([noise.innovation]))[0])
 
 
 def sandwiches(

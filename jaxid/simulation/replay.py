@@ -389,9 +389,10 @@ def local_line(
         noise: Standard deviation of a reading by joint, (n,); None: estimated from the log.
     """
     if log.integrated:
-        return log.position[k], _parabola(log.readings, log.period, k, _REACHES[0])[0]
+        return log.position[k], np.asarray(_parabola(log.readings, log.period, k, _REACHES[0])[0])
     noise = signals.high_band_std(log.filled) if noise is None else noise
-    return line_at(log.filled, log.period, k, noise)
+    position, velocity = line_at(log.filled, log.period, k, noise)
+    return np.asarray(position), np.asarray(velocity)
 
 
 def line_at(
