@@ -22,8 +22,8 @@ from jaxid.numerics.lanes import accelerator, cores
 from jaxid.scene import Scene
 from jaxid.studies.levels import Level, levels_of
 
-# Fraction of the memory that the chunks in work may take together.
-_MEMORY = 0.25
+# Fraction of the memory that the chunks in work may take together, and of an accelerator's.
+_MEMORY, _MEMORY_OF_DEVICE = 0.25, 0.5
 # On a processor: largest number of runs in a chunk of long logs, beyond which the arrays exceed its cache;
 # number of samples in a chunk of short logs; and largest number of runs in a compiled call. Runs that need
 # different solves next then fill each other's gaps.
@@ -232,7 +232,9 @@ def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
     # Residual, Jacobian and trajectory, kept twice over by the solver.
     each = 8 * samples * refined * joints * 2 * (len(machine.parameters.free) + 10)
     if accelerator():
-        return int(np.clip(_MEMORY * _memory() / each, 1, min(_RUNS_OF_DEVICE, runs)))
+        # Chunks of one size, since a smaller one takes as long.
+        chunks = np.ceil(runs / np.clip(_MEMORY_OF_DEVICE * _memory() / each, 1, _RUNS_OF_DEVICE))
+        return int(np.ceil(runs / chunks))
     most, shared = max(_LARGEST, _SAMPLES // samples), -(-runs // workers)
     return int(np.clip(_MEMORY * _memory() / workers / each, 1, min(most, shared)))
 
