@@ -1,9 +1,10 @@
 """Batches on an accelerator against all cores of the same machine: many sets at once, and whole studies.
 
-    python -m benchmarks.accelerator [--quick] [--no-write]
+    python -m benchmarks.accelerator [--quick] [--no-write] [--to FOLDER] [--seconds 300]
 
-prints the table and writes results/accelerator.json and .md beside this file. Needs a machine with an
-accelerator that JAX sees, and a JAX that can use it.
+prints the table and writes accelerator.json and .md after every row, to results/ beside this file or to
+another folder. Needs a machine with an accelerator that JAX sees, and a JAX that can use it. A process that
+fails or takes too long leaves a dash in the table.
 """
 
 import argparse
@@ -19,22 +20,24 @@ from pathlib import Path
 import numpy as np
 
 HERE = Path(__file__).parent
-# Sets in a call, and runs of a study.
-SETS, RUNS = (1024, 8192, 65536), {"axis": (1024, 4096), "stage": (1024, 8192)}
+# Sets in a call, and runs of a study: the studies first, which are what is asked for.
+SETS, RUNS = (8192, 1024, 65536), {"axis": (4096, 1024, 16384), "stage": (1024,)}
 # On cores: sets in a vmapped call.
 GROUP = 64
 KINDS = ("cost", "Gauss-Newton step")
 
 
-def child(kind: str, *words: object) -> dict:
-    """What a fresh process prints of itself, on a kind of device."""
+def child(kind: str, patience: float, *words: object) -> dict:
+    """What a fresh process prints of itself, on a kind of device; else why it printed nothing."""
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
     environment = os.environ | dict.fromkeys(names, "1") | {"JAX_PLATFORMS": kind}
     line = [sys.executable, "-m", "benchmarks.accelerator", "--child", *map(str, words)]
-    done = subprocess.run(line, capture_output=True, text=True, env=environment, cwd=HERE.parent)
-    if done.returncode:
-        raise RuntimeError(f"{kind}, {words}: {done.stderr[-2000:]}")
-    return json.loads(done.stdout.splitlines()[-1])
+    options = dict(capture_output=True, text=True, env=environment, cwd=HERE.parent, timeout=patience)
+    try:
+        done = subprocess.run(line, **options)
+    except subprocess.TimeoutExpired:
+        return {"error": f"stopped after {patience:.0f} s"}
+    return {"error": done.stderr[-1500:]} if done.returncode else json.loads(done.stdout.splitlines()[-1])
 
 
 def sets(kind: str, count: int, numerics: str) -> dict:
@@ -76,8 +79,16 @@ def study(name: str, runs: int) -> dict:
     """A study whole, the second of its kind in the process; and the first, which compiles."""
     import jaxid
     from jaxid.studies.plan import Plan
+    from jaxid.studies.runs import Runner
 
-    case = jaxid.load_case(HERE / "cases" / f"{dict(axis='fits', stage='stage')[name]}.toml")
+    case, alone = jaxid.load_case(HERE / "cases" / f"{dict(axis='fits', stage='stage')[name]}.toml"), []
+    run = Runner._run
+
+    def counted(self: Runner, level: int, number: int, ways: object) -> object:
+        alone.append(number)
+        return run(self, level, number, ways)
+
+    Runner._run = counted
     seconds = []
     for seed in (0, 1):
         begin = time.perf_counter()
@@ -85,8 +96,8 @@ def study(name: str, runs: int) -> dict:
         seconds.append(time.perf_counter() - begin)
     estimate = result.table["estimate"].values.reshape(runs, -1)
     told = dict(found=np.nan_to_num(estimate).tolist(), chunk=Plan.of(case, runs=runs).chunk)
-    failed = sum(f["runs"] for f in result.failures)
-    return {"s": seconds[1], "first_s": seconds[0], "failed": failed} | told
+    failed, ms = sum(f["runs"] for f in result.failures), 1e3 * seconds[1] / runs
+    return {"s": seconds[1], "first_s": seconds[0], "ms": ms, "failed": failed, "alone": len(alone)} | told
 
 
 def device() -> dict:
@@ -97,29 +108,30 @@ def device() -> dict:
     return {"kind": jax.local_devices()[0].device_kind} | around
 
 
-def row(what: str, count: int, *words: object) -> dict:
+def row(what: str, count: int, kinds: tuple[str, str], patience: float, *words: object) -> dict:
     """Both sides, and how far apart they are."""
-    sides = {p: child(p, *words) for p in ("cpu", "cuda")}
-    cpu, cuda = (np.asarray(side.pop("found")) for side in sides.values())
-    scale = np.maximum(np.abs(cpu).max(axis=0), 1e-300)
-    differ = np.abs(cpu - cuda) / scale
-    out = {"what": what, "count": count, "differ": float(np.max(differ)),
-           "differ_median": float(np.median(differ))} | sides  # fmt: skip
-    print(json.dumps(out), flush=True)
-    return out
+    sides = {side: child(kind, patience, *words) for side, kind in zip(("cpu", "cuda"), kinds, strict=True)}
+    out = {"what": what, "count": count}
+    found = [np.asarray(side.pop("found")) for side in sides.values() if "found" in side]
+    if len(found) == 2:
+        scale = np.maximum(np.abs(found[0]).max(axis=0), 1e-300)
+        differ = np.abs(found[0] - found[1]) / scale
+        out |= {"differ": float(np.max(differ)), "differ_median": float(np.median(differ))}
+    print(json.dumps(out | sides), flush=True)
+    return out | sides
 
 
-def measured(quick: bool) -> list[dict]:
-    """All rows."""
-    rows = []
+def asked(quick: bool) -> list[tuple]:
+    """All rows: what, how many, and the words for a process."""
+    rows = [
+        (f"study of the {name}", count, "study", name, count)
+        for name, counts in RUNS.items() for count in counts[: 1 if quick else None]
+    ]  # fmt: skip
     for kind in KINDS:
         for numerics in ("smooth", "ideal"):
             for count in SETS[: 1 if quick else None]:
                 if kind == KINDS[0] or count < SETS[-1]:
-                    rows.append(row(f"{kind}, {numerics}", count, "sets", kind, count, numerics))
-    for name, counts in RUNS.items():
-        for count in counts[: 1 if quick else None]:
-            rows.append(row(f"study of the {name}", count, "study", name, count))
+                    rows.append((f"{kind}, {numerics}", count, "sets", kind, count, numerics))
     return rows
 
 
@@ -132,24 +144,31 @@ def table(rows: list[dict], seen: dict) -> str:
         "| of | sets or runs | cores s | accelerator s | ratio | first, cores s | accelerator s | differ |",
         "|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
+    number = lambda side, name: f"{side[name]:.3g}" if name in side else "–"
     for r in rows:
         a, b = r["cpu"], r["cuda"]
-        cells = (r["what"], r["count"], f"{a['s']:.3g}", f"{b['s']:.3g}", f"{b['s'] / a['s']:.3g}",
-                 f"{a['first_s']:.3g}", f"{b['first_s']:.3g}", f"{r['differ']:.0e}")  # fmt: skip
+        ratio = f"{b['s'] / a['s']:.3g}" if "s" in a and "s" in b else "–"
+        differ = f"{r['differ']:.0e}" if "differ" in r else "–"
+        cells = (r["what"], r["count"], number(a, "s"), number(b, "s"), ratio, number(a, "first_s"),
+                 number(b, "first_s"), differ)  # fmt: skip
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines) + "\n"
 
 
-def write(found: dict) -> None:
+def write(found: dict, folder: Path) -> None:
     """What was measured, and its table."""
-    (HERE / "results" / "accelerator.json").write_text(json.dumps(found, indent=1) + "\n")
-    (HERE / "results" / "accelerator.md").write_text(table(found["rows"], found["seen"]))
+    (folder / "accelerator.json").write_text(json.dumps(found, indent=1) + "\n")
+    (folder / "accelerator.md").write_text(table(found["rows"], found["seen"]))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="the smallest batches only")
     parser.add_argument("--no-write", action="store_true", help="only print")
+    parser.add_argument("--to", type=Path, default=HERE / "results", help="folder of the results")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="no row begins after so many seconds")
+    parser.add_argument("--patience", type=float, default=600.0, help="seconds that a process may take")
+    parser.add_argument("--accelerator", default="cuda", help="what JAX calls it")
     parser.add_argument("--child", nargs="+", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.child:
@@ -157,10 +176,16 @@ def main() -> None:
         numbers = [int(w) if w.isdigit() else w for w in words]
         print(json.dumps({"sets": sets, "study": study, "device": device}[what](*numbers)))
         return
-    found = {"seen": child("cuda", "device"), "rows": measured(args.quick)}
+    begin, kinds = time.perf_counter(), ("cpu", args.accelerator)
+    found = {"seen": child(kinds[1], args.patience, "device"), "rows": []}
+    for what, count, *words in asked(args.quick):
+        if time.perf_counter() - begin > args.seconds:
+            print(f"no time left for {what}, {count}")
+            continue
+        found["rows"].append(row(what, count, kinds, args.patience, *words))
+        if not args.no_write:
+            write(found, args.to)
     print(table(found["rows"], found["seen"]))
-    if not args.no_write:
-        write(found)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from jaxid.dynamics.rhs import (
 from jaxid.model.balance import Balance, port_motion
 from jaxid.model.plant import Plant
 from jaxid.numerics.affine import depends
+from jaxid.numerics.lanes import accelerator
 from jaxid.numerics.smooth import ramp
 
 # Gauss-Seidel sweeps; chosen: 20 converge to rounding on six joints.
@@ -144,7 +145,8 @@ def _unless(done: Array, answer: tuple[State, Array], general: Callable[[], tupl
     def otherwise() -> tuple[State, Array]:
         return jax.tree.map(lambda a, b: jnp.where(done, a, b), answer, general())
 
-    return jax.lax.cond(_in_all_lanes(done), lambda: answer, otherwise)
+    # An accelerator would wait for the host to choose a branch.
+    return otherwise() if accelerator() else jax.lax.cond(_in_all_lanes(done), lambda: answer, otherwise)
 
 
 @jax.custom_batching.custom_vmap

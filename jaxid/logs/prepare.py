@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.signal
 
+from jaxid.arrays import Array, library
 from jaxid.errors import InputError
 from jaxid.logs.log import Log, integral
 from jaxid.numerics import filters as signals
@@ -455,31 +456,69 @@ def counted(
     return moving, moving
 
 
+def counted_as(
+    qd: Float[Array, "time n"], recipe: Recipe, reach: int
+) -> tuple[Bool[Array, "kept n"], Bool[Array, ""]]:
+    """Return the mask `fitted` of a log whose every joint has an encoder, around stops by a known reach.
+
+    Args:
+        qd: Filtered velocity at the log's rate.
+        recipe: Settings of the filter, chosen from a log.
+        reach: Number of samples to omit around stops and reversals, as `reach_around` has it of a like log.
+
+    Returns:
+        The mask, and whether this log has the same reach.
+    """
+    at_rest, turns = abs(qd) < np.asarray(recipe.rest_velocity), turning(qd)
+    most = max(recipe.decimator.reach, recipe.decimation - 1)
+    tried = [near for near in _nearer(most) if near >= reach]
+    same = np.ones((), bool)
+    for near in tried:
+        same = same & (spares(at_rest, turns, near) == (near == reach))
+    fitted = ~smeared(at_rest | turns if reach else at_rest, reach)[recipe.decimator.kept(len(qd))]
+    return fitted, same
+
+
+def reach_around(qd: Float[np.ndarray, "time n"], recipe: Recipe) -> int:
+    """Return the number of samples that `counted` omits around stops and reversals."""
+    at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
+    return affordable(at_rest, turning(qd), max(recipe.decimator.reach, recipe.decimation - 1))
+
+
 def affordable(at_rest: np.ndarray, turning: np.ndarray, reach: int) -> int:
     """Return the number of samples to omit around stops and reversals, so that most of the motion remains."""
-    for part in (1.0, 0.75, 0.5, 0.25):
-        near = int(np.ceil(part * reach))
-        lost = smeared(at_rest | turning, near) & ~at_rest
-        if np.all(lost.sum(axis=0) < _MOSTLY * np.maximum((~at_rest).sum(axis=0), 1)):
-            return near
-    return 0
+    return next((near for near in _nearer(reach) if spares(at_rest, turning, near)), 0)
 
 
-def turning(v: np.ndarray) -> np.ndarray:
+def _nearer(reach: int) -> list[int]:
+    """Return the numbers of samples around stops that are tried, from the largest."""
+    return [int(np.ceil(part * reach)) for part in (1.0, 0.75, 0.5, 0.25)]
+
+
+def spares(at_rest: Bool[Array, "time n"], turning: Bool[Array, "time n"], reach: int) -> Any:
+    """Check that most of the motion remains if so many samples around stops and reversals are omitted."""
+    lost = smeared(at_rest | turning, reach) & ~at_rest
+    return (lost.sum(axis=0) < _MOSTLY * (~at_rest).sum(axis=0).clip(1)).all()
+
+
+def turning(v: Float[Array, "time n"]) -> Bool[Array, "time n"]:
     """Mark the samples between which a velocity changes its sign: a fast reversal has none at rest."""
-    signs = np.sign(v)
+    xp = library(v)
+    signs = xp.sign(v)
     turns = signs[1:] != signs[:-1]
     edge = np.zeros((1, v.shape[1]), bool)
-    return np.concatenate([turns, edge]) | np.concatenate([edge, turns])
+    return xp.concatenate([turns, edge]) | xp.concatenate([edge, turns])
 
 
-def smeared(flags: np.ndarray, reach: int) -> np.ndarray:
+def smeared(flags: Bool[Array, "time n"], reach: int) -> Bool[Array, "time n"]:
     """Mark flags and their neighbours: the parallel filter spreads a stop over them."""
-    width, n = 2 * reach + 1, len(flags)
-    count = np.zeros((n + width, flags.shape[1]), np.int32)
-    np.cumsum(flags, axis=0, dtype=np.int32, out=count[reach + 1 : reach + 1 + n])
-    count[reach + 1 + n :] = count[reach + n]
-    return count[width:] > count[:-width]
+    width, beyond = 2 * reach + 1, np.zeros((reach, flags.shape[1]), bool)
+    out, joined = library(flags).concatenate([beyond, flags, beyond]), 1
+    # Each sample joins the windows of two samples, until one window is as wide as is asked.
+    while joined < width:
+        step = min(joined, width - joined)
+        out, joined = out[:-step] | out[step:], joined + step
+    return out
 
 
 def lasting(flags: np.ndarray, length: int) -> np.ndarray:

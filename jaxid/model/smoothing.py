@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 from jaxid.model.parameter import as_array
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ class Smoothing(eqx.Module):
 
 
 def typical_velocity(
-    plant: Plant, speeds: Float[np.ndarray, "rows n"], combine: Callable[[np.ndarray], float]
-) -> np.ndarray:
+    plant: Plant, speeds: Float[Array, "rows n"], combine: Callable[[Array], Array | float]
+) -> Array:
     """Return a typical velocity of all joints, or one for each if joints have different kinds of motion.
 
     A root mean square over metres and radians together would have no meaning.
@@ -50,11 +50,12 @@ def typical_velocity(
     Returns:
         A scalar for one group of joints, else (n,). A group at rest takes the value of all joints together.
     """
-    whole, groups = combine(speeds), plant.velocity_groups()
+    xp, whole, groups = library(speeds), combine(speeds), plant.velocity_groups()
     if len(groups) == 1:
-        return np.asarray(whole)
-    out = np.full(plant.joints, whole, dtype=np.float64)
+        return xp.asarray(whole)
+    out = [whole] * plant.joints
     for joints in groups:
         of_group = combine(speeds[:, list(joints)])
-        out[list(joints)] = of_group if of_group > 0 else whole
-    return out
+        for k in joints:
+            out[k] = xp.where(of_group > 0, of_group, whole)
+    return xp.stack(out).astype(np.float64)

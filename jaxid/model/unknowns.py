@@ -114,9 +114,17 @@ class Parameters:
     @property
     def bounds(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
         """Lower and upper bounds: those of the user, and those that the signs demand."""
-        lower = [max(f.lower, _sign_floor(f)) for f in self.free]
-        upper = [f.upper for f in self.free]
-        return np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+        return self.bounds_at(self.guess)
+
+    def bounds_at(
+        self, guess: Float[np.ndarray, "*starts p"]
+    ) -> tuple[Float[np.ndarray, "*starts p"], Float[np.ndarray, "*starts p"]]:
+        """Return the lower and upper bounds for other initial values, or for many sets of them."""
+        floors = {"free": (-np.inf, 0.0), "nonnegative": (0.0, 0.0)}
+        stated = [(f.lower, f.upper, *floors.get(f.sign, (0.0, _POSITIVE_FLOOR))) for f in self.free]
+        lower, upper, floor, part = np.asarray(stated, dtype=np.float64).reshape(-1, 4).T
+        lowest = np.maximum(lower, floor + part * np.abs(guess))
+        return lowest, upper + np.zeros_like(lowest)
 
     def insert(self, plant: Plant, theta: Float[Array, " p"]) -> Plant:
         """Return the plant with the unknowns set."""
@@ -193,12 +201,6 @@ def _with_entry(values: Array, index: int | tuple[int, int], value: Array | floa
     out = np.array(values)
     out[index] = value
     return out
-
-
-def _sign_floor(f: Free) -> float:
-    if f.sign == "free":
-        return -np.inf
-    return 0.0 if f.sign == "nonnegative" else _POSITIVE_FLOOR * abs(f.guess)
 
 
 def colours(enters: Bool[np.ndarray, "n p"]) -> tuple[int, ...]:

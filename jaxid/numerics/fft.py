@@ -1,10 +1,13 @@
-"""Transforms of real signals by scipy, typed as arrays."""
+"""Transforms of real signals, typed as arrays: scipy's, or JAX's in compiled code."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.fft
-from numpy.typing import NDArray
+
+from jaxid.arrays import Array, library
 
 
 def fast_length(least: int) -> int:
@@ -12,11 +15,15 @@ def fast_length(least: int) -> int:
     return int(scipy.fft.next_fast_len(least, real=True))  # pyright: ignore[reportArgumentType]  # stubs: None
 
 
-def rfft(x: np.ndarray, length: int | None = None, axis: int = -1) -> NDArray[np.complex128]:
+def rfft(x: Array, length: int | None = None, axis: int = -1) -> Any:
     """Return the transform of a real signal, padded with zeros to a length if one is given."""
-    return np.asarray(scipy.fft.rfft(x, length, axis=axis))
+    xp = library(x)
+    return np.asarray(scipy.fft.rfft(x, length, axis=axis)) if xp is np else xp.fft.rfft(x, length, axis=axis)
 
 
-def irfft(spectrum: np.ndarray, length: int | None = None, axis: int = -1) -> NDArray[np.float64]:
+def irfft(spectrum: Array, length: int | None = None, axis: int = -1) -> Any:
     """Return the real signal of a spectrum."""
-    return np.asarray(scipy.fft.irfft(spectrum, length, axis=axis))
+    xp = library(spectrum)
+    if xp is np:
+        return np.asarray(scipy.fft.irfft(spectrum, length, axis=axis))
+    return xp.fft.irfft(spectrum, length, axis=axis)

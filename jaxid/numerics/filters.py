@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
@@ -144,38 +145,39 @@ def spectral_derivatives(
     Returns:
         The band-limited signal and its derivatives of order 1 to `orders`, each (time, k).
     """
-    return tuple(y.T for y in spectral_rows(np.ascontiguousarray(x.T), period, cutoff_hz, orders))
+    return tuple(np.asarray(y.T) for y in spectral_rows(np.ascontiguousarray(x.T), period, cutoff_hz, orders))
 
 
 def spectral_rows(
-    x: Float[np.ndarray, "k time"], period: float, cutoff_hz: float, orders: int = 2
-) -> list[np.ndarray]:
+    x: Float[Array, "k time"], period: float, cutoff_hz: float, orders: int = 2
+) -> list[Float[Array, "k time"]]:
     """Return the same as `spectral_derivatives` for signals by row, whose transforms are faster."""
     n = x.shape[1]
-    span = (n - 1) * period
-    powers = _powers(n)
+    span, part = (n - 1) * period, np.linspace(0.0, 1.0, n)
     first, last = span * _end_slope(x, period), -span * _end_slope(x[:, ::-1], period)
     rise = x[:, -1] - x[:, 0]
-    cubic = np.stack([x[:, 0], first, 3 * rise - 2 * first - last, first + last - 2 * rise], axis=1)
-    rest = _tapered(x - cubic @ powers, int(_MEMORY / (cutoff_hz * period)))
+    cubic = [x[:, 0], first, 3 * rise - 2 * first - last, first + last - 2 * rise]
+    rest = _tapered(x - _polynomial(cubic, part), int(_MEMORY / (cutoff_hz * period)))
     f = np.fft.rfftfreq(rest.shape[1], period)
     f = f[f < cutoff_hz]
     spectrum = rfft(rest)[:, : len(f)] * roll_off(f, cutoff_hz)
     out = []
     for _ in range(orders + 1):
-        out.append(irfft(spectrum, rest.shape[1])[:, :n] + cubic @ powers[: cubic.shape[1]])
+        out.append(irfft(spectrum, rest.shape[1])[:, :n] + _polynomial(cubic, part))
         spectrum = spectrum * (2j * np.pi * f)
-        cubic = cubic[:, 1:] * np.arange(1, cubic.shape[1]) / span
+        cubic = [k * c / span for k, c in enumerate(cubic)][1:] or [0.0 * rise]
     return out
 
 
-@lru_cache(maxsize=4)
-def _powers(n: int) -> np.ndarray:
-    """Return the powers 0 to 3 of the fraction of a signal's length, (4, n)."""
-    return np.linspace(0.0, 1.0, n) ** np.arange(4)[:, None]
+def _polynomial(coefficients: list[Float[Array, " k"]], x: Float[np.ndarray, " n"]) -> Float[Array, "k n"]:
+    """Return the values of a polynomial of each row; its coefficients begin with the constant one."""
+    out = coefficients[-1][:, None]
+    for c in reversed(coefficients[:-1]):
+        out = c[:, None] + x * out
+    return out
 
 
-def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
+def _tapered(x: Float[Array, "k n"], pad: int) -> Float[Array, "k padded"]:
     """Return signals by row, zero at both ends, followed by their odd continuation that fades out, and zeros.
 
     The length is one of a fast transform; a length with a large prime factor takes ten times as long.
@@ -183,11 +185,9 @@ def _tapered(x: np.ndarray, pad: int) -> np.ndarray:
     k, n = x.shape
     pad = min(pad, n - 2)
     fade = 0.5 * (1 + np.cos(np.pi * np.arange(1, pad + 1) / (pad + 1)))
-    out = np.zeros((k, fast_length(n + 2 * pad)))
-    out[:, :n] = x
-    out[:, n : n + pad] = -x[:, -2 : -pad - 2 : -1] * fade
-    out[:, out.shape[1] - pad :] = -x[:, pad:0:-1] * fade[::-1]
-    return out
+    tail, head = -x[:, -2 : -pad - 2 : -1] * fade, -x[:, pad:0:-1] * fade[::-1]
+    gap = np.zeros((k, fast_length(n + 2 * pad) - n - 2 * pad))
+    return library(x).concatenate([x, tail, gap, head], axis=1)
 
 
 def roll_off(f: np.ndarray, cutoff_hz: float) -> np.ndarray:
@@ -195,7 +195,7 @@ def roll_off(f: np.ndarray, cutoff_hz: float) -> np.ndarray:
     return 0.5 * (1 + np.cos(np.pi * np.clip((f / cutoff_hz - 0.6) / 0.4, 0.0, 1.0)))
 
 
-def _end_slope(x: np.ndarray, period: float) -> np.ndarray:
+def _end_slope(x: Array, period: float) -> Array:
     """Return the slope at the first sample of each row from a line through the first few."""
     k = min(8, x.shape[1])
     t = period * (np.arange(k) - 0.5 * (k - 1))
@@ -351,21 +351,51 @@ def high_band_std(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
     It is the median of the periodogram between 0.6 and 0.95 of the Nyquist frequency, over the median of
     an exponential distribution: spectral lines and a few bad frequencies do not change it.
     """
-    return high_band_std_of_rows(np.ascontiguousarray(x.T))
+    return np.asarray(high_band_std_of_rows(np.ascontiguousarray(x.T)))
 
 
-def high_band_std_of_rows(x: Float[np.ndarray, "k time"]) -> Float[np.ndarray, " k"]:
+def high_band_std_of_rows(x: Float[Array, "k time"]) -> Float[Array, " k"]:
     """Return the same as `high_band_std` for signals by row, whose transforms are faster."""
-    n = x.shape[1]
+    xp, n = library(x), x.shape[1]
     window, t = _hann(n), np.arange(n) - 0.5 * (n - 1)
-    rest = x - np.mean(x, axis=1, keepdims=True)
-    slope = rest @ t / max(t @ t, 1e-300)
+    rest = x - xp.mean(x, axis=1, keepdims=True)
+    slope = xp.sum(rest * t, axis=1) / max(t @ t, 1e-300)
     spectrum = rfft((rest - slope[:, None] * t) * window)
     f = np.arange(spectrum.shape[1]) / n
-    band = spectrum[:, (f > 0.3) & (f < 0.475)]
+    band = spectrum[:, np.searchsorted(f, 0.3, "right") : np.searchsorted(f, 0.475)]
     # `scipy.signal.periodogram` gives the same values five times slower; studies call this for every run.
-    power = np.median(band.real**2 + band.imag**2, axis=1) / np.sum(window**2)
-    return np.sqrt(power / np.log(2.0))
+    power = _medians(band.real**2 + band.imag**2) / np.sum(window**2)
+    return xp.sqrt(power / np.log(2.0))
+
+
+def _medians(x: Float[Array, "k n"]) -> Float[Array, " k"]:
+    """Return the median of each row of nonnegative numbers.
+
+    Compiled code bisects between the bit patterns, which have the order of the numbers: sorting takes longer.
+    """
+    if library(x) is np:
+        return np.median(x, axis=1)
+    bits = jax.lax.bitcast_convert_type(x, jnp.int64)
+
+    def ranked(rank: int) -> Array:
+        """Return the least pattern that at least so many do not exceed."""
+
+        def halved(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+            low, high = ends
+            middle = low + (high - low) // 2
+            reached = jnp.sum(bits <= middle[:, None], axis=1) >= rank
+            return jnp.where(reached, low, middle + 1), jnp.where(reached, middle, high)
+
+        ends = (jnp.zeros(len(x), jnp.int64), jnp.max(bits, axis=1))
+        return jax.lax.bitcast_convert_type(jax.lax.fori_loop(0, 63, halved, ends)[0], x.dtype)
+
+    half = (x.shape[1] + 1) // 2
+    lower = ranked(half)
+    if x.shape[1] % 2:
+        return lower
+    alike = jnp.sum(x <= lower[:, None], axis=1) > half
+    above = jnp.min(jnp.where(x > lower[:, None], x, jnp.inf), axis=1)
+    return 0.5 * (lower + jnp.where(alike, lower, above))
 
 
 @lru_cache(maxsize=4)

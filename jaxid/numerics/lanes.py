@@ -19,6 +19,8 @@ import numpy as np
 from jaxid.arrays import Array
 
 T = TypeVar("T")
+# Steps of a scan over samples that are one step of its loop on an accelerator.
+_UNROLLED = 16
 
 
 class SolveRequest(NamedTuple):
@@ -133,6 +135,16 @@ _CALLED: set = set()
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(cores(), thread_name_prefix="jaxid-parts")
+
+
+def accelerator() -> bool:
+    """Return whether JAX has an accelerator."""
+    return jax.default_backend() != "cpu"
+
+
+def unrolled(steps: int) -> int:
+    """Return how many steps of a scan are compiled as one: on an accelerator each launches its kernels."""
+    return max(1, min(steps, _UNROLLED)) if accelerator() else 1
 
 
 def cores() -> int:
@@ -269,7 +281,7 @@ def quick_to_compile() -> dict[str, Any]:
 @functools.cache
 def _known(**options: Any) -> dict[str, Any]:
     """Return options of the compiler for the processor if it knows them: each version has its own."""
-    if jax.default_backend() != "cpu":
+    if accelerator():
         return {}
     try:
         jax.jit(lambda x: x + 1.0, compiler_options=options)(0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import scipy.linalg
 import scipy.signal
 from jaxtyping import Bool, Float
 
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 from jaxid.numerics.fft import fast_length, irfft, rfft
 
 # A combination of parameters counts as unidentifiable if its standard deviation, expressed as force or
@@ -73,14 +74,8 @@ class NoiseModel:
         largest = int(min(largest, samples // 10))
         whole = len(e) - np.arange(largest + 1.0)
         pairs = whole if counts.all() else np.maximum(_lagged(counts.astype(float), largest), 1.0)
-        return _by_yule_walker((_lagged(e, largest) / pairs)[None], samples)[0]
-
-    @classmethod
-    def fit_each(cls, e: Float[np.ndarray, "runs time"], largest: int = 40) -> list[NoiseModel]:
-        """Fit a model to each of several residuals, of which every sample counts; see `fit`."""
-        samples = e.shape[1]
-        largest = int(min(largest, samples // 10))
-        return _by_yule_walker(_lagged(e, largest) / (samples - np.arange(largest + 1.0)), samples)
+        coefficients, order, innovation = _by_yule_walker((_lagged(e, largest) / pairs)[None], samples)
+        return cls(np.asarray(coefficients[0, : order[0]]), float(innovation[0]))
 
     @classmethod
     def of_density(cls, power: Float[np.ndarray, " f"], rate_hz: float, order: int) -> NoiseModel:
@@ -123,14 +118,33 @@ class NoiseModel:
         return np.asarray(scipy.signal.lfilter([1.0], a, white, axis=1))[:, burn:]
 
 
-def _lagged(x: np.ndarray, largest: int) -> np.ndarray:
+def autoregressions(
+    e: Float[Array, "runs time"], largest: int = 40
+) -> tuple[Float[Array, "runs largest"], Float[Array, " runs"]]:
+    """Fit a `NoiseModel` to each of several residuals, of which every sample counts.
+
+    Args:
+        e: Residuals, (runs, time).
+        largest: Highest order that is tried.
+
+    Returns:
+        Coefficients, zero beyond the order of a model, and the standard deviations of the innovations.
+    """
+    samples = e.shape[1]
+    largest = int(min(largest, samples // 10))
+    covariance = _lagged(e, largest) / (samples - np.arange(largest + 1.0))
+    coefficients, _, innovation = _by_yule_walker(covariance, samples)
+    return coefficients, innovation
+
+
+def _lagged(x: Array, largest: int) -> Array:
     """Return the sums of x[k] x[k + lag] along the last axis for lags up to `largest`."""
     size = fast_length(x.shape[-1] + largest + 1)
     spectrum = rfft(x, size)
     return irfft(spectrum.real**2 + spectrum.imag**2, size)[..., : largest + 1]
 
 
-def _by_yule_walker(r: Float[np.ndarray, "runs lags"], samples: int) -> list[NoiseModel]:
+def _by_yule_walker(r: Float[Array, "runs lags"], samples: int) -> tuple[Array, Array, Array]:
     """Return the models of residuals with these covariances, each of the order that Akaike's criterion takes.
 
     Levinson's recursion, for all residuals side by side.
@@ -138,44 +152,75 @@ def _by_yule_walker(r: Float[np.ndarray, "runs lags"], samples: int) -> list[Noi
     Args:
         r: Covariance of each residual at the lags from zero.
         samples: Number of samples that count.
+
+    Returns:
+        Coefficients (runs, lags - 1), zero beyond the order; orders (runs,); and standard deviations of the
+        innovations (runs,).
     """
-    runs, largest = r.shape[0], r.shape[1] - 1
-    going = r[:, 0] > 0
+    xp, (runs, lags) = library(r), r.shape
+    largest = lags - 1
+    places, going = np.arange(largest), r[:, 0] > 0
     # Taper, because long lags have few pairs and an untapered estimate need not be a covariance.
-    r = r * (1 - np.arange(largest + 1) / (largest + 1) * 1e-3)
-    variance = np.where(going, r[:, 0], 1.0)
-    best_score, best_variance = samples * np.log(variance), np.where(going, r[:, 0], 0.0)
-    a, best, orders = np.zeros((runs, largest)), np.zeros((runs, largest)), np.zeros(runs, int)
-    for order in range(1, largest + 1):
-        known = a[:, : order - 1]
-        k = (r[:, order] - np.sum(known * r[:, order - 1 : 0 : -1], axis=1)) / variance
-        going = going & (np.abs(k) < 1)
-        if not going.any():
-            break
-        k = np.where(going, k, 0.0)
-        a[:, : order - 1] = known - k[:, None] * known[:, ::-1]
-        a[:, order - 1] = k
-        variance = variance * (1 - k**2)
-        score = samples * np.log(variance) + 2 * order
+    r = r * (1 - np.arange(lags) / lags * 1e-3)
+    variance = xp.where(going, r[:, 0], 1.0)
+
+    def longer(order: Any, state: tuple) -> tuple:
+        a, variance, going, best, best_score, best_variance, orders = state
+        mirrored = xp.take(a, (order - 2 - places) % largest, axis=1) * (places < order - 1)
+        k = (xp.take(r, order, axis=1) - xp.sum(mirrored * r[:, 1:], axis=1)) / variance
+        going = going & (xp.abs(k) < 1)
+        k = xp.where(going, k, 0.0)[:, None]
+        a = xp.where(places == order - 1, k, a - k * mirrored)
+        variance = variance * (1 - k[:, 0] ** 2)
+        score = samples * xp.log(variance) + 2 * order
         better = going & (score < best_score)
-        best[better], orders[better] = a[better], order
-        best_score, best_variance = (
-            np.where(better, new, old) for new, old in ((score, best_score), (variance, best_variance))
-        )
-    return [NoiseModel(b[:n], float(np.sqrt(v))) for b, n, v in zip(best, orders, best_variance, strict=True)]
+        held = lambda new, old: xp.where(better, new, old)
+        best = xp.where(better[:, None], a, best)
+        ends = held(score, best_score), held(variance, best_variance), held(order, orders)
+        return a, variance, going, best, *ends
+
+    none = np.zeros((runs, largest))
+    state = (none, variance, going, none, samples * xp.log(variance), xp.where(going, r[:, 0], 0.0))
+    state = (*state, np.zeros(runs, int))
+    if xp is np:
+        for order in range(1, lags):
+            state = longer(order, state)
+    else:
+        state = jax.lax.fori_loop(1, lags, longer, state)
+    *_, best, _, best_variance, orders = state
+    return best, orders, xp.sqrt(best_variance)
 
 
 def sandwich(jacobian: Float[np.ndarray, "time p"], noise: NoiseModel) -> Float[np.ndarray, "p p"]:
     """Return J' R J with J the Jacobian and R the covariance of the residual."""
     if not noise.coefficients.size:
         return noise.innovation**2 * (jacobian.T @ jacobian)
-    size = fast_length(len(jacobian) + min(len(jacobian), _REMEMBERED))
-    weight = noise.density(size)
-    weight[1 : (size + 1) // 2] *= 2.0  # negative frequencies
-    # By rows, of which the transforms are faster; real and imaginary parts take turns.
-    spectrum = rfft(np.ascontiguousarray(jacobian.T), size).view(np.float64)
-    spectrum *= np.repeat(np.sqrt(weight), 2)
-    return spectrum @ spectrum.T / size
+    # By rows, of which the transforms are faster.
+    rows = np.ascontiguousarray(jacobian.T)[None]
+    return np.asarray(sandwiches(rows, noise.coefficients[None], np.array([noise.innovation]))[0])
+
+
+def sandwiches(
+    rows: Float[Array, "runs p time"],
+    coefficients: Float[Array, "runs order"],
+    innovation: Float[Array, " runs"],
+) -> Float[Array, "runs p p"]:
+    """Return J' R J of many fits.
+
+    Args:
+        rows: Jacobian of each residual by rows, (runs, p, time).
+        coefficients, innovation: Models of the residuals, see `NoiseModel`.
+    """
+    xp, time = library(rows), rows.shape[-1]
+    size = fast_length(time + min(time, _REMEMBERED))
+    gain = rfft(xp.concatenate([np.ones((len(coefficients), 1)), -coefficients], axis=1), size)
+    # Negative frequencies count too.
+    twice = np.full(gain.shape[1], 2.0)
+    twice[0] = twice[(size + 1) // 2 :] = 1.0
+    weight = innovation[:, None] * xp.sqrt(twice / (gain.real**2 + gain.imag**2))
+    spectrum = rfft(rows, size) * weight[:, None]
+    gram = lambda x: x @ xp.swapaxes(x, 1, 2)
+    return (gram(spectrum.real) + gram(spectrum.imag)) / size
 
 
 def cross_sandwich(
@@ -359,6 +404,33 @@ def assess_from_sums(
     return _precision(names, normal, meat, norm, signal, hessian)
 
 
+def deviations(
+    gram: Float[np.ndarray, "runs p p"],
+    meat: Float[np.ndarray, "runs p p"],
+    signal: Float[np.ndarray, " runs"],
+    scale: Float[np.ndarray, "runs p"],
+) -> tuple[Float[np.ndarray, "runs p"], Bool[np.ndarray, " runs"]]:
+    """Return the standard deviations of many fits, and which of them identify all unknowns.
+
+    The deviations of the others do not count: `assess_from_sums` says what such a fit identifies.
+
+    Args:
+        gram, meat, signal, scale: See `assess_from_sums`, of every fit.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        norm = np.sqrt(np.einsum("kii->ki", gram))
+        known = np.all(norm * np.abs(scale) > 1e-9 * signal[:, None], axis=1)
+        known &= np.all(np.isfinite(gram), axis=(1, 2)) & np.all(np.isfinite(meat), axis=(1, 2))
+        norm = np.where(known[:, None], norm, 1.0)
+        outer = norm[:, :, None] * norm[:, None]
+        normal, meat = (np.where(known[:, None, None], x / outer, np.eye(len(norm.T))) for x in (gram, meat))
+        values, vectors = np.linalg.eigh(normal)
+        spread = _spread(vectors, meat)
+        known &= ~np.any(_blind(values, spread, signal[:, None]), axis=1)
+        inverse = (vectors / values[:, None]) @ np.swapaxes(vectors, 1, 2)
+        return np.sqrt(np.einsum("kij,kjl,kli->ki", inverse, meat, inverse)) / norm, known
+
+
 @dataclass(frozen=True)
 class Rows:
     """Residual of one of several logs, at a fit of all of them.
@@ -474,9 +546,7 @@ def _precision(
 ) -> Precision:
     """Return the precision by the normal matrix, the covariance of the gradient, and the scale of both."""
     values, vectors = np.linalg.eigh(normal)
-    spread = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", vectors, meat, vectors), 0.0))
-    safe = np.maximum(values, 1e-300)
-    blind = (values < _ROUNDING * values[-1]) | (spread > _UNTOLD * signal * safe)
+    blind = _blind(values, _spread(vectors, meat), signal)
     seen, strength = vectors[:, ~blind], values[~blind]
     inverse = seen @ np.diag(1 / strength) @ seen.T if strength.size else 0 * normal
     covariance, kind, curvature = inverse @ meat @ inverse, GAUSS_NEWTON, None
@@ -494,6 +564,17 @@ def _precision(
     untold = named_directions(names, vectors[:, blind])
     information = values / max(values[-1], 1e-300)
     return Precision(covariance, identifiable, untold, information, kind, curvature, white)
+
+
+def _spread(vectors: Float[np.ndarray, "... p p"], meat: Float[np.ndarray, "... p p"]) -> np.ndarray:
+    """Return the standard deviation of the gradient along each direction, (..., p)."""
+    return np.sqrt(np.maximum(np.einsum("...ik,...ij,...jk->...k", vectors, meat, vectors), 0.0))
+
+
+def _blind(values: Float[np.ndarray, "... p"], spread: np.ndarray, signal: np.ndarray | float) -> np.ndarray:
+    """Mark the directions that are not identifiable, by the eigenvalues of the information, (..., p)."""
+    loud = spread > _UNTOLD * signal * np.maximum(values, 1e-300)
+    return (values < _ROUNDING * values[..., -1:]) | loud
 
 
 def hessian_covariance(

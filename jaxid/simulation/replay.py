@@ -11,7 +11,7 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Bool, Float
 
-from jaxid.arrays import Array
+from jaxid.arrays import Array, library
 from jaxid.controllers import PID, Controller, with_effects
 from jaxid.dynamics.hidden_joints import resting
 from jaxid.errors import InputError
@@ -263,9 +263,9 @@ def start_shows(off: Float[np.ndarray, "time k"]) -> bool:
     return bool(np.mean(squares[:_FIRST]) > _FAR_MORE * np.mean(squares[_FIRST:]))
 
 
-def start_shows_by_run(off: Float[np.ndarray, "time runs k"]) -> Bool[np.ndarray, " runs"]:
+def start_shows_by_run(off: Float[Array, "time runs k"]) -> Bool[Array, " runs"]:
     """Check each of several runs like `start_shows`, without missing readings."""
-    first, rest = (np.einsum("trk,trk->r", x, x) / len(x) for x in (off[:_FIRST], off[_FIRST:]))
+    first, rest = ((x * x).sum(axis=(0, 2)) / len(x) for x in (off[:_FIRST], off[_FIRST:]))
     return first > _FAR_MORE * rest
 
 
@@ -389,14 +389,15 @@ def local_line(
         noise: Standard deviation of a reading by joint, (n,); None: estimated from the log.
     """
     if log.integrated:
-        return log.position[k], _parabola(log.readings, log.period, k, _REACHES[0])[0]
+        return log.position[k], np.asarray(_parabola(log.readings, log.period, k, _REACHES[0])[0])
     noise = signals.high_band_std(log.filled) if noise is None else noise
-    return line_at(log.filled, log.period, k, noise)
+    position, velocity = line_at(log.filled, log.period, k, noise)
+    return np.asarray(position), np.asarray(velocity)
 
 
 def line_at(
-    x: Float[np.ndarray, "time k"], period: float, k: int, noise: Float[np.ndarray, " k"]
-) -> tuple[np.ndarray, np.ndarray]:
+    x: Float[Array, "time k"], period: float, k: int, noise: Float[Array, " k"]
+) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Return the position and velocity at sample k of each column; see `local_line`.
 
     Args:
@@ -405,23 +406,22 @@ def line_at(
         k: Number of the sample.
         noise: Standard deviation of a reading by column, (k,).
     """
+    xp = library(x)
     position, velocity, size = _parabola(x, period, k, _REACHES[0])
     # The second term tolerates rounding in a log without noise.
-    spread = _STRAY * size * noise + 1e-12 * np.abs(velocity)
+    spread = _STRAY * size * noise + 1e-12 * xp.abs(velocity)
     low, high = velocity - spread, velocity + spread
     going = np.ones(position.shape, bool)
     for reach in _REACHES[1:]:
         q, v, size = _parabola(x, period, k, reach)
-        spread = _STRAY * size * noise + 1e-12 * np.abs(v)
-        low, high = np.maximum(low, v - spread), np.minimum(high, v + spread)
+        spread = _STRAY * size * noise + 1e-12 * xp.abs(v)
+        low, high = xp.maximum(low, v - spread), xp.minimum(high, v + spread)
         going = going & (low <= high)
-        position, velocity = np.where(going, q, position), np.where(going, v, velocity)
+        position, velocity = xp.where(going, q, position), xp.where(going, v, velocity)
     return position, velocity
 
 
-def _parabola(
-    x: Float[np.ndarray, "time k"], period: float, k: int, reach: int
-) -> tuple[np.ndarray, np.ndarray, float]:
+def _parabola(x: Float[Array, "time k"], period: float, k: int, reach: int) -> tuple[Array, Array, float]:
     """Return value and slope at sample k, and the slope's standard deviation for noise of deviation one."""
     lo = int(np.clip(k - reach, 0, max(len(x) - 2 * reach - 1, 0)))
     x = x[lo : lo + 2 * reach + 1]

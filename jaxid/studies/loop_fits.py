@@ -1,70 +1,150 @@
-"""Fits of output error to many simulated logs of a loop, as three compiled programs for a chunk of runs.
+"""Fits of output error to many simulated logs of a loop: one compiled program from noise to intervals.
 
-One program simulates and reads the logs, one solves their balances for the starts, and one fits. Between
-them are transforms and sums of all runs at once. Decisions that a single fit takes from its log are taken
-once, for the nominal log. A run that would decide otherwise is left to the estimators.
+Its arrays hold a chunk of runs side by side. Decisions that a single fit takes from its log are taken once,
+for the nominal log. A run that would decide otherwise is left to the estimators.
 """
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
+from jaxid.controllers import Controller
 from jaxid.estimators.common.levenberg_marquardt import Transform, levenberg_marquardt
 from jaxid.estimators.common.shapes import shapes
 from jaxid.estimators.common.side_by_side import Ends, descend_side_by_side
 from jaxid.estimators.inverse_dynamics import linear_scale, linear_unknowns
 from jaxid.gap import SHORT
-from jaxid.logs.prepare import Recipe, counted
+from jaxid.logs.prepare import Recipe, counted_as, reach_around
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import scatter
-from jaxid.numerics.filters import Decimator, high_band_std_of_rows, spectral_rows
-from jaxid.numerics.lanes import side_by_side
-from jaxid.numerics.precision import NoiseModel, assess_from_sums, sandwich
+from jaxid.numerics.filters import high_band_std_of_rows, spectral_rows
+from jaxid.numerics.lanes import accelerator, cores, side_by_side
+from jaxid.numerics.precision import assess_from_sums, autoregressions, deviations, sandwiches
+from jaxid.sensors.encoder import Sensor
 from jaxid.session import Session, enough
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.force_balance import ForceData, force_residual, size_of_force
-from jaxid.simulation.loops import closed_loop
+from jaxid.simulation.loops import Drive, closed_loop
 from jaxid.simulation.replay import Numerics, Replay, line_at, make_replay, start_shows_by_run
 from jaxid.studies.levels import Level
-from jaxid.studies.plan import Plan, accelerator
-from jaxid.studies.rows import RunRow
+from jaxid.studies.plan import Draw, Plan
+from jaxid.studies.rows import Arrays, converged, tracking_of
 
 # The unknowns of a start are identifiable if a standard deviation, as a force, is at most this part of the
 # measured one: as in `jaxid.numerics.precision`.
 _SURELY = 0.5
 # Runs side by side on a processor: twice as many no longer fit its caches.
 _LANES = 8
-# Samples of a Jacobian that are copied at once.
-_AT_ONCE = 1000
+# First samples that the velocity at the start is read from.
+_HEAD = 64
 
 
-# Rows of a run by estimator, its reference, and the motion that followed it, (time, n).
-Fitted = tuple[list[RunRow], np.ndarray | None, np.ndarray]
-
-
-@dataclass(frozen=True)
-class _Logs:
-    """Simulated logs of a chunk of runs.
+class _Level(eqx.Module):
+    """Everything that the runs of a level have in common.
 
     Args:
-        position: Readings, (time, runs, n).
-        force: Logged commands, (time, runs, m).
-        followed: True positions at the samples, (time, runs, n).
+        plant, places: The simulated plant, and the places of its unknowns.
+        drive, controller, signal, disturbance, position, velocity, sensor: Its loop, see `closed_loop`.
+        model, model_places: The plant of the model, and the places of its unknowns.
+        gain: Declared force per unit of command.
+        replay: The simulation of the nominal log.
+        rest_velocity: Scale of the smoothed sign in the balance, see `force_balance.sharpened`.
+        linear, transform: Scales of the unknowns in the balance and in the fit.
+        recipe: Filter of the logs.
+        reach: Number of samples that are omitted around stops and reversals.
+        hold: Time for which a command is held [s].
+        damping: Damping of the fit to the balance.
+        enough: Samples of motion that a log must have.
     """
 
-    position: np.ndarray
-    force: np.ndarray
-    followed: np.ndarray
+    plant: Plant
+    drive: Drive
+    controller: Controller
+    signal: Array
+    disturbance: Array
+    position: Array
+    velocity: Array
+    sensor: Sensor
+    model: Plant
+    gain: Array
+    replay: Replay
+    rest_velocity: Array
+    linear: Transform
+    transform: Transform
+    places: tuple = eqx.field(static=True)
+    model_places: tuple = eqx.field(static=True)
+    recipe: Recipe = eqx.field(static=True)
+    reach: int = eqx.field(static=True)
+    hold: float = eqx.field(static=True)
+    damping: float = eqx.field(static=True)
+    enough: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, level: Level, session: Session, numerics: Numerics) -> _Level:
+        """Collect them from a level and the session of its nominal log."""
+        scene, model, recipe, data = level.scene, level.machine, session.recipe, session.fit.data
+        machine, controller = scene.machine, scene.machine.controller
+        assert controller is not None, "only loops are fitted so"
+        times = scene.drive.period * np.arange(len(scene.signal))
+        transform, damping = linear_scale(model)
+        return cls(
+            plant=machine.plant,
+            drive=scene.drive,
+            controller=controller,
+            signal=scene.signal,
+            disturbance=disturbance_at(machine.disturbance, times),
+            position=scene.position,
+            velocity=scene.velocity,
+            sensor=machine.sensor,
+            model=model.plant,
+            gain=np.asarray(model.gain),
+            replay=make_replay(session.machine, session.fit.log, numerics),
+            rest_velocity=typical_velocity(model.plant, np.asarray(recipe.rest_velocity)[None], np.min),
+            linear=transform,
+            transform=Transform.of(model.parameters),
+            places=machine.parameters.places,
+            model_places=model.parameters.places,
+            recipe=recipe,
+            reach=reach_around(data.qd, recipe),
+            hold=recipe.hold_of(machine.hold, model.hold_period or data.period),
+            damping=damping,
+            enough=enough(model),
+        )
+
+
+class _Found(eqx.Module):
+    """Results of the program, by run.
+
+    Args:
+        theta, steps: Estimates and numbers of evaluations, (runs, p) and (runs,).
+        gram, meat: Matrices J'J and J'RJ of the fit, (runs, p, p) each.
+        signal: 2-norm of the centred readings, (runs,).
+        tracking: Tracking errors, see `tracking_of`.
+        good: Whether no decision of the run differs from that of the nominal log, (runs,).
+        balance: Matrix J'J of the balance, (runs, p, p); its cost (runs,), and size of the force (runs,).
+    """
+
+    theta: Float[Array, "runs p"]
+    steps: Array
+    gram: Float[Array, "runs p p"]
+    meat: Float[Array, "runs p p"]
+    signal: Float[Array, " runs"]
+    tracking: Float[Array, "runs drives 2"]
+    good: Bool[Array, " runs"]
+    balance: tuple[Float[Array, "runs p p"], Float[Array, " runs"], Float[Array, " runs"]]
 
 
 @dataclass(frozen=True)
@@ -73,17 +153,14 @@ class LoopFits:
 
     Args:
         plan: The study.
-        level: The level.
         machine: The machine of the model, at the guesses.
-        recipe: Filter of the logs.
-        replay: The simulation of the nominal log.
+        level: Everything that the runs have in common.
     """
 
     plan: Plan
-    level: Level
     machine: Machine
-    recipe: Recipe
-    replay: Replay
+    level: _Level
+    _device: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
     def of(cls, plan: Plan, level: Level, session: Session, numerics: Numerics | None) -> LoopFits | None:
@@ -114,6 +191,7 @@ class LoopFits:
             and machine.unknown_reference is None
             and not isinstance(machine.disturbance, str)
             and recipe.derivatives == "spectral"
+            and not recipe.keeps_reversals
             and recipe.median is None
             and all(session.fit.log.measured)
             and session.fit.log.samples > SHORT
@@ -122,164 +200,86 @@ class LoopFits:
             and not np.any(shapes(machine))
             and not _delays(machine)
         )
-        if not plain:
-            return None
-        return cls(plan, level, machine, recipe, make_replay(session.machine, session.fit.log, numerics))
+        return cls(plan, machine, _Level.of(level, session, numerics)) if plain else None
 
-    def rows(self, runs: Sequence[int]) -> list[Fitted | None]:
-        """Return for each run its row, the reference and the true motion; None for a run that is left.
+    def fitted(self, drawn: Sequence[Draw]) -> tuple[Bool[np.ndarray, " runs"], Arrays]:
+        """Fit the runs that have these draws.
 
         Args:
-            runs: Numbers of the runs; fewer than a chunk are filled up, so that one shape serves all.
+            drawn: Truth, start and generator of each run.
+
+        Returns:
+            The mask of the runs that are done, and the columns of all of them with their `tracking`,
+            (1, runs, ...) each. The others are left to the estimators, which draw the same noise.
         """
         lanes = self.plan.chunk if accelerator() else min(self.plan.chunk, _LANES)
-        groups = [runs[first : first + lanes] for first in range(0, len(runs), lanes)]
-        return [row for group in groups for row in self._rows_of_group(group, lanes)]
+        parts = [self._fitted(drawn[first : first + lanes], lanes) for first in range(0, len(drawn), lanes)]
+        done = np.concatenate([done for done, _ in parts])
+        return done, {n: np.concatenate([columns[n] for _, columns in parts], axis=1) for n in parts[0][1]}
 
-    def _rows_of_group(self, runs: Sequence[int], lanes: int) -> list:
-        filled = [*runs, *[runs[-1]] * (lanes - len(runs))]
-        drawn = [self.plan.drawn(k) for k in filled]
-        logs = self._simulated(drawn)
-        sound = np.all(np.isfinite(logs.position), axis=(0, 2)) & np.all(
-            np.isfinite(logs.followed), axis=(0, 2)
-        )
-        if not np.any(sound):
-            return [None] * len(runs)
-        by_run = np.ascontiguousarray(np.moveaxis(logs.position, 0, -1))
-        guesses = np.stack([start for _, start, _ in drawn])
-        theta, velocity, good = self._starts(logs, by_run, guesses)
-        ends = self._fitted(logs, by_run, theta, velocity)
-        return self._rows(logs, ends, sound & good)[: len(runs)]
+    def _fitted(self, drawn: Sequence[Draw], lanes: int) -> tuple[np.ndarray, Arrays]:
+        """Fit the runs of one call; fewer than its lanes are filled up, so that one shape serves all."""
+        filled = [*range(len(drawn)), *[len(drawn) - 1] * (lanes - len(drawn))]
+        truth, start = (np.stack([drawn[k][part] for k in filled]) for part in (0, 1))
+        bounds = self.machine.parameters.bounds_at(start)
+        noise = self._noise(drawn, lanes)
+        # An accelerator has memory for one chunk; on a processor each thread has its own.
+        with self._device if accelerator() else contextlib.nullcontext():
+            found: _Found = jax.tree.map(np.asarray, _program(self.level, truth, start, bounds, *noise))
+        found = jax.tree.map(lambda x: x[: len(drawn)], found)
+        std, known = deviations(found.gram, found.meat, found.signal, _scale(found.theta))
+        identifiable = np.ones(std.shape, bool)
+        good = found.good & _identified(start[: len(drawn)], *found.balance)
+        for k in np.flatnonzero(good & ~known):
+            sums = found.gram[k], found.meat[k], float(found.signal[k]), _scale(found.theta[k])
+            precision = assess_from_sums(self.machine.parameters.names, *sums)
+            std[k], identifiable[k] = precision.std, precision.identifiable
+        columns = converged(found.theta, std, identifiable, found.steps)
+        return good, columns | {"tracking": found.tracking[None]}
 
-    def _simulated(self, drawn: list[tuple[np.ndarray, np.ndarray, np.random.Generator]]) -> _Logs:
-        """Simulate and read the logs; every run draws its noise as `Scene.simulated_log` does."""
-        scene = self.level.scene
-        machine, ticks = scene.machine, len(scene.signal)
-        joints, drives = self.machine.plant.joints, machine.gain.size
-        pick = slice(None, None, scene.every)
-        noise = np.empty((len(drawn), ticks, joints))
-        samples = len(range(0, ticks, scene.every))
-        of_command = np.zeros((len(drawn), samples, drives))
-        for k, (_, _, rng) in enumerate(drawn):
-            rng.standard_normal(out=noise[k])
-            if machine.sensor.force_noise is not None:
+    def _noise(self, drawn: Sequence[Draw], lanes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the noise of readings and logged commands, as `Scene.simulated_log` does."""
+        level, ticks = self.level, len(self.level.signal)
+        rows, logged = len(range(0, ticks, level.replay.every)), level.sensor.force_noise is not None
+        make = np.empty if len(drawn) == lanes and logged else np.zeros
+        of_readings = make((lanes, ticks, len(level.position)))
+        of_command = make((lanes, rows, level.gain.size))
+
+        def draw(k: int) -> None:
+            rng = drawn[k][2]
+            rng.standard_normal(out=of_readings[k])
+            if logged:
                 rng.standard_normal(out=of_command[k])
-        truth = np.stack([truth for truth, _, _ in drawn])
-        extra = disturbance_at(machine.disturbance, scene.drive.period * np.arange(ticks))
-        run = _simulate(
-            machine.parameters.places, machine.plant, scene.drive, machine.controller, scene.signal, extra,
-            scene.position, scene.velocity, machine.sensor, truth, noise,
-        )  # fmt: skip
-        position, command, reading = (np.asarray(x)[pick] for x in run)
-        read = lambda u, e: np.asarray(machine.sensor.read_command(u, e))
-        return _Logs(reading, read(command, np.swapaxes(of_command, 0, 1)), position)
 
-    def _starts(
-        self, logs: _Logs, by_run: Float[np.ndarray, "runs n time"], guesses: Float[np.ndarray, "runs p"]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Solve the balances; return the starts, the scales of the velocity, and the mask of sound starts."""
-        recipe, machine, period = self.recipe, self.machine, self.replay.drive.period * self.replay.every
-        runs, n, time = by_run.shape
-        motion = spectral_rows(by_run.reshape(runs * n, time), period, recipe.cutoff_hz)
-        q, qd, qdd = (np.moveaxis(x.reshape(runs, n, time), 1, 2) for x in motion)
-        counts = np.stack([counted(v, recipe, (True,) * n)[1] for v in qd])
-        lower, upper = self._bounds(guesses)
-
-        plant = machine.plant.smoothed(np.asarray(1 / 3), self._rest_velocity())
-        hold = recipe.hold_of(self.level.scene.machine.hold, machine.hold_period or period)
-        transform, damping = linear_scale(machine)
-        force = np.swapaxes(logs.force, 0, 1) * machine.gain
-        found = _solve_balances(
-            plant, machine.parameters.places, (q, qd, qdd, force, counts.astype(float)),
-            period, hold, recipe.decimator, guesses, transform, (lower, upper), damping,
-        )  # fmt: skip
-        theta, cost, gram, size, converged = (np.asarray(x) for x in found)
-        good = converged & (counts.sum(axis=(1, 2)) >= enough(machine))
-        good &= np.all((theta >= lower) & (theta <= upper), axis=1)
-        return theta, self._velocities(qd), good & self._identified(guesses, cost, gram, size)
-
-    def _velocities(self, qd: Float[np.ndarray, "runs time n"]) -> np.ndarray:
-        """Return the scale of the smoothed sign's velocity by run, as a session takes it from its log."""
-        plant = self.machine.plant
-        if len(plant.velocity_groups()) == 1:
-            return np.sqrt(np.mean(qd**2, axis=(1, 2)))
-        rms = lambda v: float(np.sqrt(np.mean(v**2)))
-        return np.stack([typical_velocity(plant, v, rms) for v in qd])
-
-    def _rest_velocity(self) -> np.ndarray:
-        """Return the velocity scale of the smoothed sign in the balance, see `force_balance.sharpened`."""
-        return typical_velocity(self.machine.plant, np.asarray(self.recipe.rest_velocity)[None], np.min)
-
-    def _bounds(self, theta: Float[np.ndarray, "runs p"]) -> tuple[np.ndarray, np.ndarray]:
-        bounds = [self.machine.parameters.with_guess(row.tolist()).bounds for row in theta]
-        return np.stack([lower for lower, _ in bounds]), np.stack([upper for _, upper in bounds])
-
-    def _identified(
-        self, guesses: np.ndarray, cost: np.ndarray, gram: np.ndarray, size: np.ndarray
-    ) -> np.ndarray:
-        """Return whether the balance identifies all unknowns, whatever the colour of its residual, (runs,).
-
-        The variance of a sum over the samples is at most their number times that of one sample, which is
-        twice the cost; a padded transform may double it. A run that fails here may still be identified.
-        """
-        norm = np.sqrt(np.einsum("kii->ki", gram))
-        scale = np.where(guesses != 0, guesses, 1.0)
-        alive = np.all(norm * np.abs(scale) > 1e-9 * size[:, None], axis=1)
-        safe = np.where(norm > 0, norm, 1.0)
-        smallest = np.linalg.eigvalsh(gram / (safe[:, :, None] * safe[:, None]))[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            spread = np.sqrt(4 * cost / smallest)
-        return alive & (smallest > 1e-9) & (spread <= _SURELY * size)
-
-    def _fitted(self, logs: _Logs, by_run: np.ndarray, theta: np.ndarray, velocity: np.ndarray) -> Ends:
-        """Fit from the starts."""
-        runs, n, time = by_run.shape
-        period = self.replay.drive.period * self.replay.every
-        noise = high_band_std_of_rows(by_run.reshape(runs * n, time))
-        head = logs.position[:64].reshape(-1, runs * n)
-        begun = line_at(head, period, 0, noise)[1].reshape(runs, n)
-        transform = Transform.of(self.machine.parameters)
-        return _fit(
-            self.replay, self.machine.parameters.places, self.machine.plant, logs.position,
-            (logs.position[0], begun, velocity), theta, transform, self._bounds(theta),
-        )  # fmt: skip
-
-    def _rows(self, logs: _Logs, ends: Ends, good: np.ndarray) -> list:
-        names, reference = self.machine.parameters.names, self.level.scene.signal[:: self.level.scene.every]
-        theta, gram, steps = (np.asarray(x) for x in (ends.theta, ends.gram, ends.steps))
-        converged, residual = np.asarray(ends.converged), np.asarray(ends.residual)
-        jacobian = _by_run(np.asarray(ends.jacobian))
-        runs, n = residual.shape[1:]
-        e = np.moveaxis(residual, 0, -1).reshape(runs * n, -1)
-        noises = NoiseModel.fit_each(np.where(np.isfinite(e), e, 0.0))
-        centred = logs.position - logs.position.mean(axis=0)
-        signal = np.sqrt(np.sum(centred**2, axis=(0, 2)))
-        shows = start_shows_by_run(residual)
-        out: list = []
-        for k in range(runs):
-            if not (good[k] and converged[k]) or shows[k]:
-                out.append(None)
-                continue
-            own = noises[k * n : (k + 1) * n]
-            white = n == 1 and not own[0].coefficients.size
-            meat = own[0].innovation ** 2 * gram[k] if white else sum(
-                sandwich(jacobian[k, i].T, noise) for i, noise in enumerate(own)
-            )  # fmt: skip
-            scale = np.where(theta[k] != 0, theta[k], 1.0)
-            found = assess_from_sums(names, gram[k], np.asarray(meat), float(signal[k]), scale)
-            row = RunRow.fitted(theta[k], found.std, found.identifiable, int(steps[k]))
-            out.append(([row], reference, logs.followed[:, k]))
-        return out
+        # On a processor the chunks of a study are in threads already.
+        with ThreadPoolExecutor(cores() if accelerator() else 1) as pool:
+            list(pool.map(draw, range(len(drawn))))
+        return of_readings, of_command
 
 
-def _by_run(jacobian: Float[np.ndarray, "time p runs n"]) -> Float[np.ndarray, "runs n p time"]:
-    """Return Jacobians run by run; a few samples after the others, which then stay in the cache."""
-    time, p, runs, n = jacobian.shape
-    out = np.empty((runs, n, p, time))
-    for first in range(0, time, _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        out[..., part] = jacobian[part].transpose(2, 3, 1, 0)
-    return out
+def _scale(theta: np.ndarray) -> np.ndarray:
+    return np.where(theta != 0, theta, 1.0)
+
+
+def _identified(
+    guesses: Float[np.ndarray, "runs p"],
+    gram: Float[np.ndarray, "runs p p"],
+    cost: Float[np.ndarray, " runs"],
+    size: Float[np.ndarray, " runs"],
+) -> Bool[np.ndarray, " runs"]:
+    """Return whether the balance identifies all unknowns, whatever the colour of its residual.
+
+    The variance of a sum over the samples is at most their number times that of one sample, which is
+    twice the cost; a padded transform may double it. A run that fails here may still be identified.
+    """
+    norm = np.sqrt(np.einsum("kii->ki", gram))
+    alive = np.all(norm * np.abs(_scale(guesses)) > 1e-9 * size[:, None], axis=1)
+    safe = np.where(norm > 0, norm, 1.0)
+    scaled = np.where(alive[:, None, None], gram / (safe[:, :, None] * safe[:, None]), 0.0)
+    smallest = np.linalg.eigvalsh(scaled)[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = np.sqrt(4 * cost / smallest)
+    return alive & (smallest > 1e-9) & (spread <= _SURELY * size)
 
 
 def _delays(machine: Machine) -> bool:
@@ -288,80 +288,104 @@ def _delays(machine: Machine) -> bool:
 
 
 @side_by_side
-def _simulate(
-    places: tuple,
-    plant: Plant,
-    drive: Any,
-    controller: Any,
-    signal: Array,
-    extra: Array,
-    position: Array,
-    velocity: Array,
-    sensor: Any,
-    truth: Float[Array, "runs p"],
+def _program(
+    level: _Level,
+    truth: Float[Array, "runs q"],
+    start: Float[Array, "runs p"],
+    bounds: tuple[Float[Array, "runs p"], Float[Array, "runs p"]],
     noise: Float[Array, "runs ticks n"],
+    noise_of_command: Float[Array, "runs time m"],
+) -> _Found:
+    """Simulate, read, filter and fit all runs, and sum up what their intervals need."""
+    every, period = level.replay.every, level.replay.drive.period * level.replay.every
+    position, command, reading = (x[::every] for x in _simulated(level, truth, noise))
+    force = level.sensor.read_command(command, jnp.swapaxes(noise_of_command, 0, 1))
+    time, runs, n = reading.shape
+    rows = jnp.moveaxis(reading, 0, -1).reshape(runs * n, time)
+
+    smooth = spectral_rows(rows, period, level.recipe.cutoff_hz)
+    motion = [jnp.swapaxes(x.reshape(runs, n, time), 1, 2) for x in smooth]
+    counts, same = jax.vmap(lambda qd: counted_as(qd, level.recipe, level.reach))(motion[1])
+    arrays = (*motion, jnp.swapaxes(force, 0, 1) * level.gain, counts.astype(float))
+    begun, balance, solved = _started(level, start, bounds, arrays)
+
+    std = high_band_std_of_rows(rows)
+    velocity = line_at(reading[:_HEAD].reshape(-1, runs * n), period, 0, std)[1].reshape(runs, n)
+    rms = lambda v: jnp.sqrt(jnp.mean(v**2))
+    speed = jax.vmap(lambda v: typical_velocity(level.model, v, rms))(motion[1])
+    ends = _ends(level, reading, (reading[0], velocity, speed), begun, bounds)
+
+    models = autoregressions(jnp.moveaxis(ends.residual, 0, -1).reshape(runs * n, time))
+    columns = jnp.transpose(ends.jacobian, (2, 3, 1, 0)).reshape(runs * n, -1, time)
+    meat = sandwiches(columns, *models)
+    driven = list(level.plant.driven(n))
+    finite = lambda x: jnp.all(jnp.isfinite(x), axis=(0, 2))
+    inside = jnp.all((begun >= bounds[0]) & (begun <= bounds[1]), axis=1)
+    return _Found(
+        theta=ends.theta,
+        steps=ends.steps,
+        gram=ends.gram,
+        meat=jnp.sum(meat.reshape(runs, n, *meat.shape[1:]), axis=1),
+        signal=jnp.sqrt(jnp.sum((reading - jnp.mean(reading, axis=0)) ** 2, axis=(0, 2))),
+        tracking=tracking_of(level.signal[::every, None], position[:, :, driven]),
+        good=finite(position) & finite(reading) & same & solved & inside
+        & (jnp.sum(counts, axis=(1, 2)) >= level.enough)
+        & ends.converged & ~start_shows_by_run(ends.residual),
+        balance=balance,
+    )  # fmt: skip
+
+
+def _simulated(
+    level: _Level, truth: Float[Array, "runs q"], noise: Float[Array, "runs ticks n"]
 ) -> tuple[Array, Array, Array]:
     """Return position, command and reading of all runs at every tick, (ticks, runs, width)."""
 
     def one(truth: Array, noise: Array) -> tuple[Array, Array, Array]:
-        own = scatter(places, plant, truth)
-        run = closed_loop(own, drive, controller, signal, extra, position, velocity, sensor, noise)
+        plant = scatter(level.places, level.plant, truth)
+        loop = (level.drive, level.controller, level.signal, level.disturbance)
+        run = closed_loop(plant, *loop, level.position, level.velocity, level.sensor, noise)
         return run.position, run.command, run.reading
 
     return jax.vmap(one, out_axes=1)(truth, noise)
 
 
-@side_by_side
-def _solve_balances(
-    plant: Plant,
-    places: tuple,
-    arrays: tuple[Array, Array, Array, Array, Array],
-    period: float,
-    hold: float,
-    decimator: Decimator,
-    theta: Float[Array, "runs p"],
-    transform: Transform,
-    bounds: tuple[Array, Array],
-    damping: float,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return estimates of inverse dynamics, cost, J'J, size of the force, and convergence, by run."""
+def _started(
+    level: _Level, start: Float[Array, "runs p"], bounds: tuple[Array, Array], arrays: tuple
+) -> tuple[Array, tuple[Array, Array, Array], Array]:
+    """Return estimates of inverse dynamics, its sums as `_Found.balance` has them, and its convergence."""
+    plant = level.model.smoothed(np.asarray(1 / 3), level.rest_velocity)
+    period, decimator = level.replay.drive.period * level.replay.every, level.recipe.decimator
+    every = (True,) * arrays[0].shape[2]
 
     def one(theta: Array, lower: Array, upper: Array, arrays: tuple) -> tuple:
-        every = (True,) * arrays[0].shape[1]
-        q, qd, qdd, force, weight = arrays
-        data = ForceData(q, qd, qdd, force, weight, jnp.zeros(()), period, hold, decimator, every)
-        balance = lambda x: (data.weight * force_residual(scatter(places, plant, x), data)).ravel()
+        data = ForceData(*arrays, jnp.zeros(()), period, level.hold, decimator, every)
+
+        def balance(x: Array) -> Array:
+            return (data.weight * force_residual(scatter(level.model_places, plant, x), data)).ravel()
+
         # The balance is linear in the unknowns: its columns are computed once.
         push = lambda d: jax.jvp(balance, (theta,), (d,))
         here, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(theta.size))
-        fit = levenberg_marquardt(
-            lambda x: here + columns @ (x - theta),
-            theta,
-            transform,
-            lower,
-            upper,
-            damping=damping,
-            keep=False,
-        )
-        return fit.theta, fit.cost, columns.T @ columns, size_of_force(plant, data), fit.converged
+        line, damping = lambda x: here + columns @ (x - theta), level.damping
+        fit = levenberg_marquardt(line, theta, level.linear, lower, upper, damping=damping, keep=False)
+        return fit.theta, (columns.T @ columns, fit.cost, size_of_force(plant, data)), fit.converged
 
-    return jax.vmap(one)(theta, *bounds, arrays)
+    return jax.vmap(one)(start, *bounds, arrays)
 
 
-@side_by_side
-def _fit(
-    replay: Replay,
-    places: tuple,
-    plant: Plant,
+def _ends(
+    level: _Level,
     measured: Float[Array, "time runs n"],
-    starts: tuple[Array, Array, Array],
+    starts: tuple[Float[Array, "runs n"], Float[Array, "runs n"], Array],
     theta: Float[Array, "runs p"],
-    transform: Transform,
     bounds: tuple[Array, Array],
 ) -> Ends:
+    """Fit from position and velocity at the start, and the scale of the smoothed sign's velocity."""
+
     def one(theta: Array, position: Array, velocity: Array, scale: Array) -> Array:
-        run = replace(replay, position=position, velocity=velocity)
-        return run(scatter(places, plant.smoothed(velocity_scale=scale), theta)).position
+        run = replace(level.replay, position=position, velocity=velocity)
+        plant = level.model.smoothed(velocity_scale=scale)
+        return run(scatter(level.model_places, plant, theta)).position
 
     residual = lambda theta: measured - jax.vmap(one, out_axes=1)(theta, *starts)
-    return descend_side_by_side(residual, theta, transform, *bounds)
+    return descend_side_by_side(residual, theta, level.transform, *bounds)

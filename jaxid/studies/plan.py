@@ -18,12 +18,12 @@ from jaxid.errors import InputError
 from jaxid.estimators import need_consistent, need_likelihood
 from jaxid.machine import Machine
 from jaxid.names import DISCOVER, IN_LOOP, SEVERAL_LOGS, USER_METHODS
-from jaxid.numerics.lanes import cores
+from jaxid.numerics.lanes import accelerator, cores
 from jaxid.scene import Scene
 from jaxid.studies.levels import Level, levels_of
 
-# Fraction of the memory that the chunks in work may take together.
-_MEMORY = 0.25
+# Fraction of the memory that the chunks in work may take together, and of an accelerator's.
+_MEMORY, _MEMORY_OF_DEVICE = 0.25, 0.5
 # On a processor: largest number of runs in a chunk of long logs, beyond which the arrays exceed its cache;
 # number of samples in a chunk of short logs; and largest number of runs in a compiled call. Runs that need
 # different solves next then fill each other's gaps.
@@ -35,6 +35,9 @@ _UNSTATED = 2**32
 _LAYOUT = 3
 # Deviations of a drawn delay that a simulation's memory of past commands allows for.
 _FARTHEST = 5.0
+
+# True values of a run, the start of its fit, and the generator of its noise.
+Draw = tuple[np.ndarray, np.ndarray, np.random.Generator]
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class Plan:
             case: The case; its [study] may be left out.
             runs: Number of runs at each level; None: that of the case.
             seed: Seed of everything that is drawn, from 0 to 2^31 - 1.
-            workers: Number of chunks that run at once; None: one a core, or one on an accelerator.
+            workers: Number of chunks that run at once; None: see `at_once`.
 
         Raises:
             InputError: If the case cannot be simulated, no parameter is unknown, the case states no noise
@@ -151,21 +154,24 @@ class Plan:
             for level in range(len(self.levels)) for first in starts
         ]  # fmt: skip
 
-    def drawn(self, run: int) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
+    def drawn(self, run: int) -> Draw:
         """Draw the true values of a run, the start of its fit, and the generator of its noise.
 
         They depend on the seed and the run's number alone, so that every level has the same draws.
         """
         rng = np.random.default_rng([self.seed, run])
-        truth = self.scene.machine.parameters.guess
-        truth = truth * np.exp(self.draw * rng.standard_normal(len(truth)))
-        # A fit must be able to reach it.
-        truth = np.clip(truth, *self.scene.machine.parameters.bounds)
-        start = rng.standard_normal(len(self.names))
-        guess = self.machine.parameters.guess
-        lower, upper = self.machine.parameters.bounds
-        started = np.clip(guess * np.exp(self.start_spread * start), lower, upper)
+        true, guess = self._centres
+        # A fit must be able to reach the true values.
+        truth = _about(*true, self.draw * rng.standard_normal(len(true[0])))
+        started = _about(*guess, self.start_spread * rng.standard_normal(len(self.names)))
         return truth, started, rng
+
+    @functools.cached_property
+    def _centres(self) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Value, lower and upper bound of each parameter of the simulated machine, and of the model."""
+        both = (self.scene.machine.parameters, self.machine.parameters)
+        true, guess = ((p.guess, *p.bounds) for p in both)
+        return true, guess
 
     @property
     def manifest(self) -> dict:
@@ -188,6 +194,11 @@ class Plan:
             "layout": _LAYOUT,
             "versions": {p: version(p) for p in packages},
         }
+
+
+def _about(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return values changed by factors exp(change), within bounds."""
+    return np.minimum(np.maximum(value * np.exp(change), lower), upper)
 
 
 def _need_learner(case: Case, scene: Scene) -> None:
@@ -214,20 +225,18 @@ def _without(case: Case, hidden: tuple[str, ...]) -> Case:
 
 
 def _fitting(levels: tuple[Level, ...], runs: int, workers: int) -> int:
-    """Return the number of runs that are solved together: as many as memory holds for all workers."""
+    """Return the number of runs that are solved together: as many as the memory holds."""
     machine, joints = levels[0].machine, levels[0].model.plant.joints
     samples = max(len(level.scene.signal) for level in levels)
     refined = 8 if machine.controller is None and machine.hold == "band_limited" else 1
     # Residual, Jacobian and trajectory, kept twice over by the solver.
     each = 8 * samples * refined * joints * 2 * (len(machine.parameters.free) + 10)
-    most = _RUNS_OF_DEVICE if accelerator() else max(_LARGEST, _SAMPLES // samples)
-    shared = -(-runs // workers)
+    if accelerator():
+        # Chunks of one size, since a smaller one takes as long.
+        chunks = np.ceil(runs / np.clip(_MEMORY_OF_DEVICE * _memory() / each, 1, _RUNS_OF_DEVICE))
+        return int(np.ceil(runs / chunks))
+    most, shared = max(_LARGEST, _SAMPLES // samples), -(-runs // workers)
     return int(np.clip(_MEMORY * _memory() / workers / each, 1, min(most, shared)))
-
-
-def accelerator() -> bool:
-    """Return whether JAX has an accelerator, which one chunk then fills."""
-    return jax.local_devices()[0].platform != "cpu"
 
 
 def _memory() -> float:
@@ -239,8 +248,8 @@ def _memory() -> float:
 
 
 def at_once() -> int:
-    """Return the number of chunks in work at once: one a core, or one on an accelerator."""
-    return 1 if accelerator() else cores()
+    """Return the number of chunks in work at once: one a core, or one computed and one drawn."""
+    return 2 if accelerator() else cores()
 
 
 def fingerprint(case: Case) -> str:

@@ -93,12 +93,12 @@ class Study:
         for estimator, setting, own in cells(self.table):
             firsts: dict[str, str] = {}
             counts: Counter[str] = Counter()
-            for k in range(own.sizes["run"]):
-                why = _why(own.isel(run=k))
-                if why:
-                    kind = re.sub(r"\d[\d.e+-]*", "#", why)
-                    firsts.setdefault(kind, why)
-                    counts[kind] += 1
+            converged, messages = own["converged"].values, own["message"].values
+            for k in np.flatnonzero(~_succeeded(own)):
+                why = "nothing is identifiable" if converged[k] else str(messages[k])
+                kind = re.sub(r"\d[\d.e+-]*", "#", why)
+                firsts.setdefault(kind, why)
+                counts[kind] += 1
             out += [
                 {"estimator": estimator, **setting, "why": firsts[kind], "runs": runs}
                 for kind, runs in counts.most_common()
@@ -286,13 +286,6 @@ def gathered(plan: Plan, chunks: list[Arrays], bound: np.ndarray) -> Study:
 def _tracking_unit(machine: Machine) -> str:
     """Return the unit of the tracking error, or one for each drive, separated by commas."""
     return joined(machine.unit_by_joint("position", machine.plant.driven(machine.plant.joints)))
-
-
-def _why(run: xr.Dataset) -> str:
-    """Return the reason for which a run failed; empty if it is a success."""
-    if not run["converged"].item():
-        return str(run["message"].item())
-    return "" if _succeeded(run.expand_dims("run"))[0] else "nothing is identifiable"
 
 
 def _succeeded(runs: xr.Dataset) -> np.ndarray:

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+
+from jaxid.arrays import Array, library
 
 Arrays = dict[str, np.ndarray]
 
@@ -43,29 +46,6 @@ class RunRow:
     combination_error: np.ndarray = _column(by_parameter=True)
 
     @classmethod
-    def fitted(cls, theta: np.ndarray, std: np.ndarray, identifiable: np.ndarray, steps: int) -> RunRow:
-        """Return the row of a fit that converged.
-
-        Args:
-            theta: Estimates, (p,).
-            std: Standard deviations, (p,).
-            identifiable: Mask of the identifiable parameters, (p,).
-            steps: Evaluations of the Jacobian.
-        """
-        identifiable = identifiable & np.all(np.isfinite(theta))
-        return cls(
-            estimate=np.where(identifiable, theta, np.nan),
-            std=np.where(identifiable, std, np.nan),
-            identifiable=identifiable,
-            converged=True,
-            steps=steps,
-            message="converged",
-            named="",
-            combinations=0,
-            combination_error=np.full(len(theta), np.nan),
-        )
-
-    @classmethod
     def failed(cls, parameters: int, why: str) -> RunRow:
         """Return the row of a run that gave no estimate.
 
@@ -93,6 +73,49 @@ COLUMNS = tuple(f.name for f in fields(RunRow))
 def stacked(rows: Sequence[RunRow]) -> Arrays:
     """Return the columns of one run, an entry for each estimator."""
     return {name: np.stack([np.asarray(getattr(row, name)) for row in rows]) for name in COLUMNS}
+
+
+def converged(theta: np.ndarray, std: np.ndarray, identifiable: np.ndarray, steps: np.ndarray) -> Arrays:
+    """Return the columns of many runs whose fits converged, (1, runs, ...) each: of one estimator.
+
+    Args:
+        theta: Estimates, (runs, p).
+        std: Standard deviations, (runs, p).
+        identifiable: Masks of the identifiable parameters, (runs, p).
+        steps: Evaluations of the Jacobian, (runs,).
+    """
+    runs = len(theta)
+    identifiable = identifiable & np.isfinite(theta).all(axis=1, keepdims=True)
+    columns = {
+        "estimate": np.where(identifiable, theta, np.nan),
+        "std": np.where(identifiable, std, np.nan),
+        "identifiable": identifiable,
+        "converged": np.ones(runs, bool),
+        "steps": steps,
+        "message": np.full(runs, "converged"),
+        "named": np.full(runs, ""),
+        "combinations": np.zeros(runs, int),
+        "combination_error": np.full(theta.shape, np.nan),
+    }
+    return {name: columns[name][None] for name in COLUMNS}
+
+
+# Fraction of a run, at its end, over which tracking errors count; a law that adapts has settled by then.
+_SETTLED = 0.25
+
+
+def tracking_of(reference: Array | None, followed: Float[Array, "time ... drives"]) -> Float[Array, "... 2"]:
+    """Return root mean square and peak of the tracking errors at the end of runs, (..., drives, 2).
+
+    Args:
+        reference: The reference, of the shape of `followed`; None: there is none, and no drive has errors.
+        followed: Positions of the drives, (time, ..., drives).
+    """
+    if reference is None:
+        return np.zeros((0, 2))
+    xp = library(followed)
+    error = (reference - followed)[-max(1, round(_SETTLED * len(followed))) :]
+    return xp.stack([xp.sqrt(xp.mean(error**2, axis=0)), xp.abs(error).max(axis=0)], axis=-1)
 
 
 def variables(columns: Arrays, dims: tuple[str, ...]) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:

@@ -22,7 +22,7 @@ from jaxid.simulation.replay import Numerics
 from jaxid.studies.logs import machines_of
 from jaxid.studies.loop_fits import LoopFits
 from jaxid.studies.plan import Plan
-from jaxid.studies.rows import COLUMNS, Arrays, RunRow, stacked
+from jaxid.studies.rows import COLUMNS, Arrays, RunRow, stacked, tracking_of
 
 
 @dataclass(frozen=True)
@@ -82,19 +82,23 @@ class Runner:
         Returns:
             `estimate` and `std` (method, run, p), NaN if there is none; `converged` and
             `identifiable`; `steps`; `message` and `named` (method, run); `tracking` (method, run, drives,
-            2), see `_tracking`; `truth` and `start` (run, p); `seconds` that the chunk took.
+            2), see `tracking_of`; `truth` and `start` (run, p); `seconds` that the chunk took.
         """
         began = time.perf_counter()
         level, runs = self.plan.chunks[number]
         ways = self.ways(level) if self.plan.fits else None
-        fitted = [None] * len(runs) if ways is None or ways.together is None else ways.together.rows(runs)
-        left = [k for k, done in zip(runs, fitted, strict=True) if done is None]
-        others = iter(run_batched([self._run(level, k, ways) for k in left], self.plan.lanes))
-        results = [next(others) if done is None else self._arrays_of(level, *done) for done in fitted]
-        # An exception ends its run only, even one of a library.
-        arrays = [self._all_failed(x) if isinstance(x, Exception) else x for x in results]
-        out = {name: np.stack([row[name] for row in arrays], axis=1) for name in (*COLUMNS, "tracking")}
         drawn = [self.plan.drawn(k) for k in runs]
+        done, out = np.zeros(len(runs), bool), None
+        if ways is not None and ways.together is not None:
+            done, out = ways.together.fitted(drawn)
+        left = np.flatnonzero(~done)
+        if left.size:
+            found = run_batched([self._run(level, runs[k], ways) for k in left], self.plan.lanes)
+            # An exception ends its run only, even one of a library.
+            rows = [self._all_failed(x) if isinstance(x, Exception) else x for x in found]
+            alone = {name: np.stack([row[name] for row in rows], axis=1) for name in (*COLUMNS, "tracking")}
+            out = alone if out is None else _merged(out, alone, left)
+        assert out is not None, "a chunk has runs"
         out["truth"] = np.stack([truth[self.plan.own] for truth, _, _ in drawn])
         out["start"] = np.stack([start for _, start, _ in drawn])
         out["seconds"] = np.asarray(time.perf_counter() - began)
@@ -149,7 +153,7 @@ class Runner:
     ) -> Arrays:
         """Return the arrays of one run, whose joints followed a reference so, (time, n)."""
         driven = self.plan.levels[level].machine.plant.driven(followed.shape[1])
-        return _run_arrays(rows, _tracking(reference, followed[:, list(driven)]))
+        return _run_arrays(rows, tracking_of(reference, followed[:, list(driven)]))
 
     def _all_failed(self, error: Exception) -> Arrays:
         drives = 0 if self.plan.machine.controller is None else self.plan.machine.gain.size
@@ -201,18 +205,6 @@ def _row_of_law(plan: Plan, run: Trajectory) -> RunRow:
     return replace(row, estimate=estimate, identifiable=identifiable, converged=closed)
 
 
-# Fraction of a run, at its end, over which tracking errors count; a law that adapts has settled by then.
-_SETTLED = 0.25
-
-
-def _tracking(reference: np.ndarray | None, followed: np.ndarray) -> np.ndarray:
-    """Return the root mean square and the peak of the drives' tracking errors at the end, (drives, 2)."""
-    if reference is None:
-        return np.zeros((0, 2))
-    error = (reference - followed)[-max(1, round(_SETTLED * len(followed))) :]
-    return np.stack([np.sqrt(np.mean(error**2, axis=0)), np.abs(error).max(axis=0)], axis=1)
-
-
 def _row_of_search(plan: Plan, session: Session) -> RunRow:
     """Return the declared parameters that `discover` estimates, and the effects that it names."""
     from jaxid.commands.discover import explore
@@ -231,6 +223,13 @@ def _row_of_search(plan: Plan, session: Session) -> RunRow:
 
 def _words(error: Exception) -> str:
     return str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+
+
+def _merged(together: Arrays, alone: Arrays, places: np.ndarray) -> Arrays:
+    """Return the arrays of a chunk, those of the runs at some places replaced by others."""
+    order = np.arange(together["steps"].shape[1])
+    order[places] = len(order) + np.arange(len(places))
+    return {name: np.concatenate([together[name], alone[name]], axis=1)[:, order] for name in alone}
 
 
 def _run_arrays(rows: list[RunRow], tracking: np.ndarray) -> Arrays:

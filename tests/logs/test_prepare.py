@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 import pytest
 
@@ -10,7 +11,15 @@ import jaxid
 from jaxid.errors import InputError
 from jaxid.gap import noise_floor
 from jaxid.logs.log import Log
-from jaxid.logs.prepare import choose_recipe, differentiate, prepare
+from jaxid.logs.prepare import (
+    Recipe,
+    choose_recipe,
+    counted,
+    counted_as,
+    differentiate,
+    prepare,
+    reach_around,
+)
 from jaxid.numerics.filters import parabolic_cutoff
 from jaxid.results.as_json import recipe_json
 from jaxid.session import open_session
@@ -274,3 +283,16 @@ def test_results_tell_the_median_and_the_parabola(tmp_path, axis):
     assert (told["median"], told["derivatives"], told["reach"]) == (5, "parabolic", 4)
     assert told["cutoff_hz"] == pytest.approx(RATE * parabolic_cutoff(4))
     assert not {"median", "reach"} & set(recipe_json(open_session(case_of(tmp_path), axis[0])))
+
+
+@pytest.mark.parametrize("speed", [0.1, 10.0, 20.0])
+def test_compiled_counts_are_those_of_a_log_with_the_same_reach(speed):
+    """A known reach around stops and reversals gives the same samples; another reach is noticed."""
+    recipe = Recipe(60.0, 4, 5, 3, (0.3,), True, "spectral", edge=0.15)
+    v = np.sin(speed * 0.01 * np.arange(3000.0))[:, None]
+    reach = reach_around(v, recipe)
+    compiled = jax.jit(lambda v, reach: counted_as(v, recipe, reach), static_argnums=1)
+    counts, same = compiled(v, reach)
+    np.testing.assert_array_equal(counts, counted(v, recipe, (True,))[1])
+    assert same
+    assert not compiled(v, reach - 1 if reach else 5)[1]

@@ -252,3 +252,17 @@ def test_high_band_std_is_that_of_a_periodogram(samples):
     f, p = scipy.signal.periodogram(x, 50.0, window="hann", detrend="linear", axis=0)
     density = np.median(p[(f > 15.0) & (f < 23.75)], axis=0) / np.log(2.0)
     np.testing.assert_allclose(signals.high_band_std(x), np.sqrt(density * 25.0), rtol=1e-9)
+
+
+@pytest.mark.parametrize("samples", [600, 601])
+def test_compiled_filters_of_rows_are_those_of_arrays(samples):
+    """Studies filter in compiled code what a session filters outside; the medians there are bisected."""
+    rng = np.random.default_rng(5)
+    rows = np.cumsum(rng.standard_normal((2, samples)), axis=1)
+    spectra = lambda x: signals.spectral_rows(x, PERIOD, 60.0)
+    for ours, compiled in zip(spectra(rows), jax.jit(spectra)(rows), strict=True):
+        np.testing.assert_allclose(compiled, ours, rtol=1e-10, atol=1e-10 * np.abs(ours).max())
+    # Counts of an encoder give many equal powers; a row of zeros gives nothing else.
+    rows = np.stack([rows[0], np.round(rows[1]), np.zeros(samples), np.resize([0.0, 1.0], samples)])
+    std = signals.high_band_std_of_rows(rows)
+    np.testing.assert_allclose(jax.jit(signals.high_band_std_of_rows)(rows), std, rtol=1e-11, atol=1e-15)

@@ -12,7 +12,15 @@ from jaxid.dynamics.residuals import residual_along
 from jaxid.effects import EFFECTS
 from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import scatter
-from jaxid.numerics.precision import NoiseModel, assess, full_hessian, sandwich
+from jaxid.numerics.precision import (
+    NoiseModel,
+    assess,
+    assess_from_sums,
+    autoregressions,
+    deviations,
+    full_hessian,
+    sandwich,
+)
 from jaxid.plants import Axis
 
 AR2 = np.array([1.4, -0.6])
@@ -269,11 +277,27 @@ def test_full_hessian_is_jaxs_and_more_than_gauss_newtons():
 def test_models_of_many_residuals_are_those_of_each():
     rng = np.random.default_rng(3)
     e = np.stack([rng.standard_normal(4000), NoiseModel(AR2, 0.5).sample(rng, 4000, 1)[0], np.zeros(4000)])
-    for own, model in zip(e, NoiseModel.fit_each(e), strict=True):
-        alone = NoiseModel.fit(own, np.ones(own.shape, bool))
-        assert len(model.coefficients) == len(alone.coefficients)
-        np.testing.assert_allclose(model.coefficients, alone.coefficients, rtol=1e-9, atol=1e-12)
-        assert model.innovation == pytest.approx(alone.innovation, rel=1e-12)
+    for coefficients, innovations in (autoregressions(e), jax.jit(autoregressions)(e)):
+        for own, a, innovation in zip(e, coefficients, innovations, strict=True):
+            alone = NoiseModel.fit(own, np.ones(own.shape, bool))
+            order = len(alone.coefficients)
+            np.testing.assert_allclose(a[:order], alone.coefficients, rtol=1e-9, atol=1e-12)
+            assert not np.any(a[order:])
+            assert innovation == pytest.approx(alone.innovation, rel=1e-12)
+
+
+def test_deviations_of_many_fits_are_those_of_each():
+    rng = np.random.default_rng(4)
+    jacobian = rng.standard_normal((3, 500, 4)) * [1.0, 1e3, 1e-3, 1.0]
+    jacobian[1, :, 3] = jacobian[1, :, 0]  # two unknowns that only their sum tells
+    jacobian[2, :, 2] = 0.0
+    gram = np.swapaxes(jacobian, 1, 2) @ jacobian
+    meat = gram * np.array([0.5, 0.3, 0.2])[:, None, None]
+    signal, scale = np.full(3, 20.0), np.ones((3, 4))
+    std, known = deviations(gram, meat, signal, scale)
+    alone = [assess_from_sums(list("abcd"), *each) for each in zip(gram, meat, signal, scale, strict=True)]
+    assert list(known) == [bool(a.identifiable.all()) for a in alone] == [True, False, False]
+    np.testing.assert_allclose(std[0], alone[0].std, rtol=1e-12)
 
 
 def test_the_sandwich_of_white_noise_needs_no_transform():

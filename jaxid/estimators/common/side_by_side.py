@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Progress, Transform, advanced_by_model
+from jaxid.numerics.lanes import accelerator
 
 # Evaluations of a fit, at most; those that take more are for `levenberg_marquardt`.
 _MAX_EVALUATIONS = 30
@@ -108,7 +109,13 @@ def descend_side_by_side(
 def _sums(
     e: Float[Array, "time fits n"], jacobian: Float[Array, "time p fits n"]
 ) -> tuple[Float[Array, " fits"], Float[Array, "fits p"], Float[Array, "fits p p"]]:
-    """Return half the sums of squares, J'e and J'J of all fits, added up sample by sample."""
+    """Return half the sums of squares, J'e and J'J of all fits.
+
+    On a processor they are added up sample by sample, so that a vector holds fits.
+    """
+    if accelerator():
+        cost, gradient = 0.5 * jnp.einsum("tfn,tfn->f", e, e), jnp.einsum("tpfn,tfn->fp", jacobian, e)
+        return cost, gradient, jnp.einsum("tpfn,tqfn->fpq", jacobian, jacobian)
     p = jacobian.shape[1]
 
     def add(sums: tuple, now: tuple) -> tuple[tuple, None]:
