@@ -19,8 +19,6 @@ import numpy as np
 from jaxid.arrays import Array
 
 T = TypeVar("T")
-# Steps of a scan over samples that are one step of its loop on an accelerator.
-_UNROLLED = 16
 
 
 class SolveRequest(NamedTuple):
@@ -140,11 +138,6 @@ def _threads() -> ThreadPoolExecutor:
 def accelerator() -> bool:
     """Return whether JAX has an accelerator."""
     return jax.default_backend() != "cpu"
-
-
-def unrolled(steps: int) -> int:
-    """Return how many steps of a scan are compiled as one: on an accelerator each launches its kernels."""
-    return max(1, min(steps, _UNROLLED)) if accelerator() else 1
 
 
 def cores() -> int:

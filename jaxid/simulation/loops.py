@@ -23,7 +23,6 @@ from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, step, vector_field
 from jaxid.model.plant import Plant
 from jaxid.numerics.delays import shifted, shifted_hold
-from jaxid.numerics.lanes import unrolled
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.solvers import RELATIVE, AdaptiveStep
 
@@ -261,8 +260,7 @@ def closed_loop(
     moved = None if inertial is None else (velocity, velocity, jnp.zeros_like(velocity))
     renews = None if inertial is None else jnp.arange(len(times)) % inertial.hold == 0
     inputs = (path, disturbance, noise, times, fresh, renews)
-    carry, unroll = (x0, memory, past, last, held, moved), unrolled(len(times))
-    _, (q, v, u, reading, found) = jax.lax.scan(tick, carry, inputs, unroll=unroll)
+    _, (q, v, u, reading, found) = jax.lax.scan(tick, (x0, memory, past, last, held, moved), inputs)
     return Trajectory(q, v, u, reading, found)
 
 
