@@ -47,7 +47,7 @@ def refit_of(session: Session, start: Estimate) -> Estimate:
     if method == "prediction_error":
         return _refit_innovations(session, start)
     if method == "inverse_dynamics" and session.machine.controller is None:
-        note = "not refitted in simulation: without a controller any error of a force drives the motion from the log"
+        note = "not refitted in simulation: without a controller any error of a force drives it from the log"
         return replace(start, notes=(*start.notes, note))
     if blind or session.fit.log.reference is None and session.machine.controller is not None:
         return start

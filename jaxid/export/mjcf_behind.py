@@ -11,7 +11,7 @@ from jaxid.export.xml_text import Element, XmlText
 
 # Effect that puts a part of the inertia behind a spring, with or without a clearance.
 BEHIND = "joint_flexibility"
-# Least rotor beside a second joint, as a part of the inertia behind it: with none the mass matrix is singular.
+# Least rotor before a second joint, as a part of the inertia behind it: with none the matrix is singular.
 _LEAST = 0.01
 # Attributes that say where a joint is, and those by which it has nothing of its class.
 _PLACE = ("class", "type", "axis", "pos")
@@ -31,8 +31,8 @@ class BehindJoints:
 
     The usual construction: the body of a joint gets a second one about its axis. The actuator and the
     rotor stay at the first, which is what an encoder at the motor shows; the body and all that it carries
-    move with both. A spring is the second joint's stiffness. With a clearance it is a tendon's over that joint
-    alone, whose spring has a dead band.
+    move with both. A spring is the second joint's stiffness. With a clearance it is that of a tendon over
+    this joint alone, whose spring has a dead band.
 
     Args:
         compiled: Its compiled model of the text.
@@ -86,7 +86,7 @@ class BehindJoints:
             only = _tag("joint", {"joint": name, "coef": "1"})
             self.tendons.append(f"<fixed {_listed(band)}>{only}</fixed>")
             self.notes.append(
-                f"{shown(effect)}: joint '{name}' keeps its damping inside the clearance too, where jaxid has none"
+                f"{shown(effect)}: joint '{name}' has its damping inside the clearance too, and jaxid none"
             )
         self._rotor(effect, index, first)
         self.notes.append(
@@ -105,8 +105,8 @@ class BehindJoints:
         if armature < _LEAST * load:
             self.text.set(self.joints[index], {"armature": repr(_LEAST * load)})
             self.notes.append(
-                f"armature of joint '{first}' was {armature:.3g}, and a motor before a spring needs one: written "
-                f"as {_LEAST * load:.3g}"
+                f"armature of joint '{first}' was {armature:.3g}, and a motor before a spring needs one: "
+                f"written as {_LEAST * load:.3g}"
             )
 
     def _free_name(self, wanted: str) -> str:

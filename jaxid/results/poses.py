@@ -31,20 +31,39 @@ def poses_of(session: Session, run: OpenedLog, after: Gap) -> PoseStrip | None:
     plant, log = session.machine.plant, run.log
     if not isinstance(plant, LinkTree) or log.steady is not None or not np.all(log.measured):
         return None
-    rows = np.unique(np.linspace(0, len(log.time) - 1, _FRAMES).round().astype(int))
-    measured = np.asarray(log.position)[rows]
-    simulated = None if after.simulation is None else np.asarray(after.simulation.position)[rows]
-    if simulated is not None and not np.all(np.isfinite(simulated)):
-        simulated = None
-    places = places_of(plant, measured)
+    simulated = None if after.simulation is None else np.asarray(after.simulation.position)
+    return strip_of(plant, run.name, log.time, log.position, simulated)
+
+
+def strip_of(
+    plant: LinkTree,
+    name: str,
+    time: Float[np.ndarray, " N"],
+    position: Float[np.ndarray, "N n"],
+    simulated: Float[np.ndarray, "N n"] | None = None,
+) -> PoseStrip | None:
+    """Return the poses of an arm at instants spread over a motion; None if it has no extent.
+
+    Args:
+        plant: The arm.
+        name: Name of the log.
+        time: Its time [s].
+        position: Positions of the free joints [rad or m].
+        simulated: Simulated ones beside them; left out if they diverge.
+    """
+    rows = np.unique(np.linspace(0, len(time) - 1, _FRAMES).round().astype(int))
+    places = places_of(plant, np.asarray(position)[rows])
     if np.ptp(places, axis=(0, 1)).max() < _LEAST:
         return None
+    beside = None if simulated is None else simulated[rows]
+    if beside is not None and not np.all(np.isfinite(beside)):
+        beside = None
     return PoseStrip(
-        name=run.name,
-        time=np.asarray(log.time)[rows],
+        name=name,
+        time=np.asarray(time)[rows],
         bones=bones_of(plant),
         measured=places,
-        simulated=None if simulated is None else places_of(plant, simulated),
+        simulated=None if beside is None else places_of(plant, beside),
         up=_up(plant),
     )
 

@@ -101,6 +101,8 @@ def test_discover_names_all_that_the_file_lacks(files):
 def test_an_open_loop_that_runs_away_is_not_refitted(files):
     robot, log = files
     tables = RobotCase.of(str(robot), [str(log)], search=True).tables | {"output_error": {}}
+    # As a search has it on its way: one of the two terms of the spring.
+    tables["effects"] = [{"kind": "constant_force", "joint": 3, "level": {"guess": 1.0}}]
     session = open_session(tables, log, (), align_hold=True, method="discover")
     baseline, _ = start_search(session)
     kept = refit_of(session, baseline)

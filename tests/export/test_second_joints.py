@@ -9,8 +9,9 @@ from tests.export.test_replayed import RATE, result_of
 from tests.support.written_logs import write_csv
 
 ROTOR, LOAD = 0.02, 0.05
-TURRET = f"""<mujoco><compiler angle="radian"/><option timestep="0.0005"/>
-  <default><joint axis="0 0 1"/><default class="geared"><joint damping="0.2" range="-3 3"/></default></default>
+TURRET = f"""<mujoco><compiler angle="radian"/><option timestep="0.0001"/>
+  <default><joint axis="0 0 1"/>
+    <default class="geared"><joint damping="0.2" range="-3 3"/></default></default>
   <worldbody>
     <!-- the turret -->
     <body><joint name="yaw" class="geared" armature="{ROTOR}"/>
@@ -48,11 +49,13 @@ def test_mujoco_moves_the_second_joint_as_jaxid_does(tmp_path, values, name, par
     file = export(result, "mjcf")
     model = mujoco.MjModel.from_xml_string(file.content.decode())
     assert [model.joint(k).name for k in range(model.njnt)] == ["yaw", name]
-    assert file.added == (name,) and not file.lost
+    assert file.added == (name,)
+    assert not file.lost
     assert b"<!-- the turret -->" in file.content
     second = model.joint(name)
     assert second.bodyid == model.joint("yaw").bodyid
-    assert not model.jnt_limited[second.id] and model.dof_armature[second.dofadr[0]] == 0
+    assert not model.jnt_limited[second.id]
+    assert model.dof_armature[second.dofadr[0]] == 0
 
     found = check_export(result, "mjcf", file, forced(tmp_path))
     cost = next(sizes for what, sizes in found.costs if what == f"without the second joint '{name}'")

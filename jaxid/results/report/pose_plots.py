@@ -19,13 +19,16 @@ from jaxid.results.report.plots import AFTER, MEASURED
 _MM = 1e3
 
 
-def plot_poses(strip: PoseStrip, *, size: tuple[float, float] = (11.5, 4.0), columns: int = 8) -> Figure:
+def plot_poses(
+    strip: PoseStrip, *, size: tuple[float, float] = (11.5, 4.0), columns: int = 8, first: str = "measured"
+) -> Figure:
     """Draw an arm at some instants, from the side and from above, all in one scale.
 
     Args:
         strip: The poses.
         size: Width and height of the figure [inch].
         columns: Most frames beside each other; a row of them has both views.
+        first: Name of the poses that a strip always has.
     """
     figure = Figure(figsize=size, layout="constrained")
     count = len(strip.time)
@@ -48,8 +51,9 @@ def plot_poses(strip: PoseStrip, *, size: tuple[float, float] = (11.5, 4.0), col
         if view == 0:
             ax.set_title(f"{strip.time[k]:.2f} s", fontsize=FONT, color=TEXT)
         if column == 0:
-            ax.text(0.0, 1.0, words, transform=ax.transAxes, fontsize=FONT - 1, color="#777777", va="bottom")
-    _legend(figure, panels[0, 0], limits[0], strip)
+            side = {"transform": ax.transAxes, "rotation": 90, "ha": "right", "va": "center"}
+            ax.text(0.0, 0.5, words, fontsize=FONT - 1, color="#777777", **side)
+    _legend(figure, panels[0, 0], limits[0], strip, first)
     return figure
 
 
@@ -109,14 +113,16 @@ def _limits(
     return low - margin, high + margin
 
 
-def _legend(figure: Figure, ax: Axes, limits: tuple[np.ndarray, np.ndarray], strip: PoseStrip) -> None:
+def _legend(
+    figure: Figure, ax: Axes, limits: tuple[np.ndarray, np.ndarray], strip: PoseStrip, first: str
+) -> None:
     """Name the lines, and draw a bar of a round length."""
     (left, low), (wide, _) = limits
     length = 10.0 ** math.floor(math.log10(max(wide - left, 1e-9) / 2))
     ax.plot([left, left + length], [low, low], color=TEXT, lw=1.2, clip_on=False)
     text = f"{short(_MM * length)} mm" if length < 1 else f"{short(length)} m"
     ax.text(left, low, text, fontsize=FONT - 1, color=TEXT, va="top")
-    handles = [Line2D([], [], color=MEASURED, lw=4.0, label="measured")]
+    handles = [Line2D([], [], color=MEASURED, lw=4.0, label=first)]
     if strip.simulated is not None:
         handles.append(Line2D([], [], color=AFTER, lw=1.4, label="simulated"))
     figure.legend(handles=handles, loc="outside upper left", ncols=2, frameon=False, fontsize=FONT)
