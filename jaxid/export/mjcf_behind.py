@@ -73,7 +73,7 @@ class BehindJoints:
         values, first = effect["parameters"], effect["joint_name"]
         index, gap = self.names.index(first), values.get("gap")
         element = self.joints[index]
-        name = self._free_name(f"{first}_{'spring' if gap is None else 'play'}")
+        name = self._free_name(f"{first}_{'spring' if gap is None else 'backlash'}")
         stiffness, damping = (repr(float(values[key])) for key in ("stiffness", "damping"))
         # Place and axis as they are written, whatever class they come from; nothing else of the first joint.
         place = {key: element.attributes[key] for key in _PLACE if key in element.attributes}

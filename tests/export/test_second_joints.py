@@ -42,7 +42,7 @@ def elastic(folder, text=TURRET, **values):
 
 
 @pytest.mark.parametrize(
-    ("values", "name", "part"), [({}, "yaw_spring", 0.01), ({"gap": 0.1}, "yaw_play", 0.05)]
+    ("values", "name", "part"), [({}, "yaw_spring", 0.01), ({"gap": 0.1}, "yaw_backlash", 0.05)]
 )
 def test_mujoco_moves_the_second_joint_as_jaxid_does(tmp_path, values, name, part):
     result = elastic(tmp_path, **values)
