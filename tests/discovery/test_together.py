@@ -39,3 +39,17 @@ def test_only_laws_that_act_are_needed(strengths):
 def test_the_least_needed_law_comes_first():
     search, theta = linear_search(np.array([1.0, -1.0, 0.0, 3.0, 0.0, 0.7]), np.random.default_rng(1))
     assert [c.kind for c in together._needed(search, theta, [law(k) for k in range(4)])] == ["law3", "law1"]
+
+
+def test_a_law_takes_up_what_its_twin_explained():
+    search, theta = linear_search(np.array([1.0, -1.0, 0.4, 0.0, 0.0, 0.0]), np.random.default_rng(2))
+    measured, columns = search.domain.evaluate(None, 0 * theta, None)
+    noise = np.random.default_rng(3).normal(size=measured.shape)
+    columns[..., 3] = columns[..., 2] + 1e-5 * columns[..., 4]
+    search.domain.evaluate = lambda samples, at, wanted: (columns @ at + measured + noise, columns)
+    # Each has half of what one of them has alone: a tenth of the sum of squares, and by itself a fortieth.
+    first = [0, 1, 2]
+    rows = columns[..., first].reshape(-1, 3), -(measured + noise).ravel()
+    alone = np.linalg.lstsq(*rows, rcond=None)[0]
+    theta = np.array([*alone[:2], 0.5 * alone[2], 0.5 * alone[2], 0.0, 0.0])
+    assert len(together._needed(search, theta, [law(k) for k in range(4)])) == 1
