@@ -63,7 +63,7 @@ def pose_table(strip: PoseStrip) -> FigureTable:
     ends = _MM * strip.measured[:, -1]
     columns = [strip.time, *ends.T]
     if strip.simulated is not None:
-        heads += ["simulated end off by [mm]", "largest distance of a joint [mm]"]
+        heads += ["simulated end off by [mm]", "joint that is furthest off by [mm]"]
         off = _MM * np.linalg.norm(strip.simulated - strip.measured, axis=2)
         columns += [off[:, -1], off.max(axis=1)]
     rows = tuple(tuple(short(float(x), 4) for x in row) for row in zip(*columns, strict=True))
@@ -121,7 +121,8 @@ def _legend(
     length = 10.0 ** math.floor(math.log10(max(wide - left, 1e-9) / 2))
     ax.plot([left, left + length], [low, low], color=TEXT, lw=1.2, clip_on=False)
     text = f"{short(_MM * length)} mm" if length < 1 else f"{short(length)} m"
-    ax.text(left, low, text, fontsize=FONT - 1, color=TEXT, va="top")
+    below = {"xytext": (0.0, -3.0), "textcoords": "offset points", "va": "top", "annotation_clip": False}
+    ax.annotate(text, (left, low), fontsize=FONT - 1, color=TEXT, **below)
     handles = [Line2D([], [], color=MEASURED, lw=4.0, label=first)]
     if strip.simulated is not None:
         handles.append(Line2D([], [], color=AFTER, lw=1.4, label="simulated"))
