@@ -34,7 +34,7 @@ def add_together(search: Search, steps: list[Step], most: int) -> list[Step]:
         Steps of the search, with those that follow.
     """
     old = search.model
-    if search.data.q.shape[1] < 2 or search.acceptance.at_floor(old.theta):
+    if most < 1 or search.data.q.shape[1] < 2 or search.acceptance.at_floor(old.theta):
         return steps
     laws = [c for c in search.rest(Model((), old.theta)) if c.kind in _LAWS]
     if len(laws) < 2:
