@@ -366,7 +366,7 @@ def _controller(
     static = {field.name for field in fields(cls) if field.metadata.get("static")}
     arrays: dict[str, Any] = {k: v if k in static else as_array(v) for k, v in values.items()}
 
-    period = case.controller.period or _log_period(case, period)
+    period = _loop_period(case, period)
     plant, where = case.plant, f"{case.where}, [controller]"
     check_drives(case.controller.kind, plant.cls, plant.drives, plant.joints, where)
     if "model" in cls.of_machine:
@@ -407,6 +407,21 @@ def _estimator(case: Case, machine: Machine, period: float, settings: Recursive)
         )
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
+
+
+def _loop_period(case: Case, period: float | None) -> float:
+    """Return the period of the loop [s].
+
+    That of servos in a robot's file is the time step of a simulator, and no clock that a log keeps to: the
+    nearest whole part of the log's period is taken.
+    """
+    stated = case.controller.period if case.controller is not None else None
+    if not stated:
+        return _log_period(case, period)
+    if period is None or "controller" in case.tables:
+        return stated
+    whole = period / max(round(period / stated), 1)
+    return stated if abs(whole - stated) < 1e-9 * stated else whole
 
 
 def _log_period(case: Case, period: float | None) -> float:

@@ -68,6 +68,7 @@ PICTURES = (
     "where",
     "candidates",
     "profiles",
+    "motion",
 )
 # Signals of a simulated loop that output error compares with the log.
 OUTPUTS = ("position", "force", "both")

@@ -1,6 +1,7 @@
 """From a case to arrays: names, leaves, true values, and the disturbance's ticks."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
-from jaxid.build import build_machine
+from jaxid.build import _loop_period, build_machine
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
@@ -293,3 +294,18 @@ def test_a_period_stays_near_its_guess_unless_it_has_bounds(period, bounds):
     parameters = build_machine(load_case(case)).parameters
     at = parameters.names.index("cogging.period")
     assert [b[at] for b in parameters.bounds] == pytest.approx(bounds)
+
+
+@pytest.mark.parametrize(
+    ("tables", "logged", "expected"),
+    [
+        ({}, 0.0200604, 0.00200604),  # ten steps of 2 ms, as a drive's own clock has them
+        ({}, 0.02, 0.002),
+        ({}, 0.0005, 0.0005),
+        ({}, None, 0.002),
+        ({"controller": {"period": 0.002}}, 0.0200604, 0.002),
+    ],
+)
+def test_servos_of_a_file_run_in_step_with_the_log(tables, logged, expected):
+    case = SimpleNamespace(controller=SimpleNamespace(period=0.002), tables=tables)
+    assert _loop_period(case, logged) == pytest.approx(expected, rel=1e-12)

@@ -33,7 +33,10 @@ def add(commands: Commands) -> None:
     add_case_and_logs(parser)
     add_validation_logs(parser)
     parser.add_argument(
-        "--max-effects", metavar="N", type=int, default=5, help="most effects to add; default: 5"
+        "--max-effects",
+        metavar="N",
+        type=int,
+        help="most effects to add; default: 5, or two a joint if that is more",
     )
     add_numerics(parser)
     parser.add_argument(

@@ -13,6 +13,7 @@ from jaxid.names import PICTURES, SIGNALS
 _EXAMPLES = """\
 jaxid plot out friction -o friction.png
 jaxid plot out/result.json scatter --against position -o ripple.svg
+jaxid plot out motion -o motion.png
 jaxid plot out signals -o signals.csv"""
 
 

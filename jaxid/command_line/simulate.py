@@ -6,12 +6,13 @@ import argparse
 from pathlib import Path
 
 from jaxid.command_line.inputs import is_robot, need_at_least, need_sound_case
-from jaxid.command_line.outputs import progress_of
+from jaxid.command_line.outputs import picture_file, progress_of
 from jaxid.command_line.parser import Commands, add_long_command
 
 _EXAMPLES = """\
 jaxid simulate case.toml -o log.csv
-jaxid simulate case.toml -o log.csv --seed 3"""
+jaxid simulate case.toml -o log.csv --seed 3
+jaxid simulate robot.xml -o free.csv --picture free.png"""
 
 
 def add(commands: Commands) -> None:
@@ -23,6 +24,9 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("-o", metavar="LOG.csv", required=True, help="file to write the log to")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of the noise; default: 0")
+    parser.add_argument(
+        "--picture", metavar="FILE", help="an arm's motion as a strip of frames: .png, .svg or .pdf"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     need_at_least(0, "--seed", args.seed)
     path, case = ready_file(Path(args.o), overwrite=args.force), args.case
+    picture = None if args.picture is None else picture_file(args.picture, overwrite=args.force)
     if is_robot(case):
         from jaxid.commands.robot_case import let_go
 
@@ -40,9 +45,13 @@ def run(args: argparse.Namespace) -> int:
 
     with progress_of(args) as show:
         show("simulating")
-        from jaxid.commands.simulate import simulate
+        from jaxid.commands.simulate import motion_picture, simulate
 
         simulated_log = simulate(case, seed=args.seed)
+        figure = None if picture is None else motion_picture(case, simulated_log)
     simulated_log.save(path)
+    if figure is not None:
+        figure.savefig(picture, dpi=160)
+        print(f"wrote {picture}")
     print(f"{simulated_log.log.samples} samples at {simulated_log.log.rate_hz:g} Hz in {path}")
     return 0

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxid.case.case import Case, CaseLike
 from jaxid.case.user_faults import named_faults
@@ -24,6 +25,7 @@ from jaxid.discovery.score import Score
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separating.propose import Proposal, proposals
 from jaxid.discovery.superset import build_candidate_model, scales_of
+from jaxid.discovery.together import add_together
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_force, need_known_controller, need_known_reference
@@ -47,19 +49,24 @@ from jaxid.simulation.solvers import SOLVERS
 
 # A residual counts as a disagreement only if it exceeds the noise floor by this factor.
 _ABOVE_FLOOR = 1.3
+# Largest number of effects to add unless it is stated, and that by joint of an arm.
+_EFFECTS, _BY_JOINT = 5, 2
 # Number of effects that hinder the simulation and are replaced; further ones are only removed.
 _BARRED = 3
 # Reason why no break-away friction is searched.
 _UNEXPLAINED = "there is a gap that no known effect explains"
 
 
+# Matrices of a search are tall and narrow: threads of linear algebra wait for each other, and a decomposition
+# of 3600 rows takes 0.1 s of both cores in place of 1 ms of one.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 @named_faults()
 def discover(
     case: CaseLike,
     log: Logs = None,
     *,
     validate: Sequence[LogLike] = (),
-    max_effects: int = 5,
+    max_effects: int | None = None,
     refit: bool = True,
     experiments: bool | None = None,
     solver: str | None = None,
@@ -72,7 +79,7 @@ def discover(
         case: The case, its file, or a dict with its tables.
         log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
         validate: Logs that must confirm each effect, beside those of the case.
-        max_effects: Largest number of effects to add.
+        max_effects: Largest number of effects to add. None: five, or two a joint of an arm if that is more.
         refit: Whether the parameters are refitted in simulation; if not, they are those of inverse dynamics.
         experiments: Whether experiments are designed that separate rival effects. None: unless joints are
             coupled, as in an arm, whose simulation takes minutes to compile for it.
@@ -101,7 +108,7 @@ def _with_numerics(case: Case, solver: str | None, minimiser: str | Minimiser | 
 def explore(
     session: Session,
     *,
-    max_effects: int = 5,
+    max_effects: int | None = None,
     refit: bool = True,
     experiments: bool | None = None,
     progress: Callable[[str], None] = lambda text: None,
@@ -116,6 +123,7 @@ def explore(
         InputError: If the reference has unknowns.
     """
     need_known_reference(session, "an error of it would be taken for an effect")
+    chosen, max_effects = max_effects is None, _EFFECTS if max_effects is None else max_effects
     if session.machine.unforced(session.fit.log):
         return explore_unforced(session, max_effects=max_effects, progress=progress)
     need_force(session, "a search of a log with a force")
@@ -132,7 +140,10 @@ def explore(
     baseline, search = start_search(session, progress)
     # Compiling the refits takes as long as the search, and neither needs the other.
     declared = begin(in_simulation, session, baseline, refit)
+    if chosen:
+        max_effects = max(max_effects, _BY_JOINT * session.fit.data.q.shape[1])
     steps = search.run(max_effects)
+    steps = add_together(search, steps, max_effects)
     likely = search.model
     refitted = None
     if likely.added:

@@ -43,8 +43,12 @@ def refit_of(session: Session, start: Estimate) -> Estimate:
     blind = not bool(np.all(start.identifiable))
     if session.more:
         return start if blind else _refit_together(session, start)
-    if not blind and choose_method(session).method == "prediction_error":
+    method = "" if blind else choose_method(session).method
+    if method == "prediction_error":
         return _refit_innovations(session, start)
+    if method == "inverse_dynamics" and session.machine.controller is None:
+        note = "not refitted in simulation: without a controller any error of a force drives it from the log"
+        return replace(start, notes=(*start.notes, note))
     if blind or session.fit.log.reference is None and session.machine.controller is not None:
         return start
     try:

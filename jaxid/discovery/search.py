@@ -22,7 +22,7 @@ from jaxid.numerics.precision import NoiseModel
 _GONE = 1e-2
 # An effect in the model is dropped if it closes less than this part of the gap: a third of the part that it
 # must close to be named.
-_SUPERFLUOUS = 0.05
+SUPERFLUOUS = 0.05
 # Two effects are added at once if together they close `_MOST_OF_IT` of the gap, and gain more than the best
 # single effect with any partner, by `_CLEARLY` times the threshold of noise and by `_MUCH` of their gain. An
 # effect whose refit keeps less than `_KEPT` of its linear evidence takes no part in pairs.
@@ -102,8 +102,8 @@ class Search:
         self.samples = self.acceptance.samples
         self.model = Model((), self.superset.neutral)
         # The largest threshold so far, by which effects are dropped later.
-        self._limit = 0.0
-        self._baseline = self.model.theta
+        self.limit = 0.0
+        self.baseline = self.model.theta
 
     def _acceptance(self) -> Acceptance:
         """Return the tests of models against the logs, with the domain in which they are compared."""
@@ -149,10 +149,10 @@ class Search:
             most: Largest number of effects in the model.
         """
         self.progress("fitting the baseline")
-        self._baseline = self._fit(self.model.theta, self.active)
-        self.model = Model((), self._baseline)
-        first = self._step(self.model)
-        self.model, steps = self._grow(self.model, most)
+        self.baseline = self.fit(self.model.theta, self.active)
+        self.model = Model((), self.baseline)
+        first = self.step(self.model)
+        self.model, steps = self.grow(self.model, most)
         return [first, *steps]
 
     def bar(self, c: cand.Candidate, why: str, most: int) -> list[Step]:
@@ -165,10 +165,10 @@ class Search:
         """
         model = self.without(self.model, c)
         self.barred = [*self.barred, c]
-        first = self._step(model, dropped=c, why=why)
+        first = self.step(model, dropped=c, why=why)
         # An effect that was needed beside the barred one may be superfluous without it.
-        model, dropped = self._drop_superfluous(model, self._limit, model.added)
-        self.model, steps = self._grow(model, most)
+        model, dropped = self.drop_superfluous(model, self.limit, model.added)
+        self.model, steps = self.grow(model, most)
         return [first, *dropped, *steps]
 
     def without(self, model: Model, c: cand.Candidate) -> Model:
@@ -177,31 +177,31 @@ class Search:
         active = self.fitted_by(added)
         theta = model.theta.copy()
         theta[c.index] = c.neutral
-        refitted = self._fit(theta, active)
+        refitted = self.fit(theta, active)
 
         base = self.superset.base
-        if np.all(np.abs(theta[base]) > _GONE * np.abs(self._baseline[base])):
+        if np.all(np.abs(theta[base]) > _GONE * np.abs(self.baseline[base])):
             return Model(added, refitted)
         # The effect displaced an unknown of the case, for instance as a limit that all of the force exceeds.
         # A fit does not return from values near zero: try a start from the baseline too.
-        theta[base] = self._baseline[base]
-        return Model(added, min((refitted, self._fit(theta, active)), key=self.acceptance.squares))
+        theta[base] = self.baseline[base]
+        return Model(added, min((refitted, self.fit(theta, active)), key=self.acceptance.squares))
 
-    def _grow(self, model: Model, most: int) -> tuple[Model, list[Step]]:
+    def grow(self, model: Model, most: int) -> tuple[Model, list[Step]]:
         """Add effects to a model until none is accepted, it has the most, or a set of effects recurs."""
         steps: list[Step] = []
         tried = {frozenset(id(c) for c in model.added)}
         while True:
             best, scores, limit = self.best(model, ahead=len(model.added) + 2 <= most)
-            self._limit = max(self._limit, limit)
+            self.limit = max(self.limit, limit)
             if not best or len(model.added) >= most:
-                steps.append(self._step(model, scores=scores, threshold=limit))
+                steps.append(self.step(model, scores=scores, threshold=limit))
                 return model, steps
 
             for score in best:
                 model = Model((*model.added, score.candidate), score.refitted)
-                steps.append(self._step(model, added=score, scores=scores, threshold=limit))
-            model, dropped = self._drop_superfluous(model, limit, model.added[:-1])
+                steps.append(self.step(model, added=score, scores=scores, threshold=limit))
+            model, dropped = self.drop_superfluous(model, limit, model.added[:-1])
             steps.extend(dropped)
 
             now = frozenset(id(c) for c in model.added)
@@ -327,10 +327,8 @@ class Search:
             best, ties = simplest_equivalent(good, self._chance_difference)
             if best.candidate is not named and self._takes_over(model, best, current):
                 added = tuple(best.candidate if c is named else c for c in model.added)
-                self.model = Model(added, self._fit(best.refitted, self.fitted_by(added)))
-                steps.append(
-                    self._step(self.model, added=best, dropped=named, scores=scores, threshold=limit)
-                )
+                self.model = Model(added, self.fit(best.refitted, self.fitted_by(added)))
+                steps.append(self.step(self.model, added=best, dropped=named, scores=scores, threshold=limit))
             elif best.candidate is not named:
                 ties = (best, *ties) if self._equal(current, best) else ()
             out[k] = tuple(s for s in ties if s.candidate is not self.model.added[k])
@@ -356,11 +354,11 @@ class Search:
         """Check that an effect explains the log as well as the best one."""
         return current.total > best.total - max(margin(best), self._chance_difference(best, current))
 
-    def _fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
+    def fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
         """Fit the active unknowns to the log, from and beside the others."""
         return cand.refine(self.superset, self.samples, theta, active, self.domain.evaluate)[0]
 
-    def _step(
+    def step(
         self,
         model: Model,
         *,
@@ -390,7 +388,7 @@ class Search:
             theta = model.theta.copy()
             for s, guess in zip(new, guesses, strict=True):
                 theta[s.candidate.index] = guess
-            fits.append(self._fit(theta, active))
+            fits.append(self.fit(theta, active))
         theta = min(fits, key=self.acceptance.squares)
 
         e, jacobian = self.domain.evaluate(self.samples, theta, active)
@@ -405,7 +403,7 @@ class Search:
         reason = self.acceptance.objection(index, model.theta, theta, validation, confirmed, len(active))
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
 
-    def _drop_superfluous(
+    def drop_superfluous(
         self, model: Model, limit: float, effects: Sequence[cand.Candidate]
     ) -> tuple[Model, list[Step]]:
         """Drop those of some effects whose loss is below the noise, or below what is relevant."""
@@ -414,11 +412,16 @@ class Search:
             smaller = self.without(model, c)
             if not self._costs(model, smaller, limit):
                 model = smaller
-                steps.append(self._step(model, dropped=c, threshold=limit))
+                steps.append(self.step(model, dropped=c, threshold=limit))
         return model, steps
 
     def _costs(self, model: Model, smaller: Model, limit: float) -> bool:
         """Check that a smaller model is worse than a model by more than noise and by a relevant part."""
+        lost, part = self.loss(model, smaller)
+        return lost > limit and part > SUPERFLUOUS
+
+    def loss(self, model: Model, smaller: Model) -> tuple[float, float]:
+        """Return what a smaller model loses: evidence [nats], and the part of its gap that a model closes."""
         active, remaining = self.fitted_by(model.added), self.fitted_by(smaller.added)
         e, jacobian = self.domain.evaluate(self.samples, model.theta, active)
         whitener = ev.Whitener.of(e, self.samples.moving, self.colour)
@@ -427,7 +430,7 @@ class Search:
         less, jacobian = self.domain.evaluate(self.samples, smaller.theta, remaining)
         after = now.held_out(less, jacobian[..., remaining])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
-        return lost > limit and self.acceptance.closed(less, e) > _SUPERFLUOUS
+        return lost, self.acceptance.closed(less, e)
 
 
 def _starts(score: Score) -> list[np.ndarray]:

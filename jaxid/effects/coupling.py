@@ -59,7 +59,8 @@ class JointFlexibility(Effect):
 
     e is the elongation of the spring: J (a + e'') = -k e - d e'. The inertia of the plant stays that of the
     whole; the effect subtracts its part J and adds the pull of the spring. The state is e times the spring's
-    frequency, and e': both have one size.
+    frequency, and e': both have one size. With a clearance in series no force passes while |e| < gap / 2, and
+    e less that half counts beyond: backlash between a motor with its encoder and its load.
     """
 
     title = "an elastic transmission"
@@ -75,11 +76,17 @@ class JointFlexibility(Effect):
     stiffness: Array = parameter("force/position", "positive", "of the spring")
     damping: Array = parameter("force*time/position", "positive", "beside the spring")
     load_inertia: Array = parameter("inertia", "positive", "part of the inertia behind it")
+    gap: Array | None = parameter("position", "positive", "total clearance in series with it", optional=True)
 
     def act(self, x: Signals, state: Array) -> Action:
         w = jnp.sqrt(self.stiffness / self.load_inertia)
         e, ed = state[0] / w, state[1]
         pull = self.stiffness * e + self.damping * ed
+        if self.gap is not None:
+            half = 0.5 * self.gap
+            width = _CORNER * half
+            lost = self.stiffness * smooth.clip(e, half, width)
+            pull = pull - lost - self.damping * smooth.within(e, half, width) * ed
         rate = jnp.stack([w * ed, -x.ydd - pull / self.load_inertia])
         return Action(force=self.load_inertia * x.ydd + pull, rate=rate)
 

@@ -27,6 +27,7 @@ class ExportedFile:
         notes: Parts of the result that it cannot hold, a sentence each.
         lost: Effects among them, by their numbers in `model.effects` of the result, from 0.
         real: Whether every body that was found can exist, and was written.
+        added: Names of joints that the user's file does not have.
     """
 
     content: bytes
@@ -34,6 +35,7 @@ class ExportedFile:
     notes: tuple[str, ...]
     lost: tuple[int, ...] = ()
     real: bool = True
+    added: tuple[str, ...] = ()
 
 
 def shown(effect: Mapping[str, Any]) -> str:

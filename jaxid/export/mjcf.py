@@ -16,6 +16,7 @@ from jaxid.case.mjcf import is_one_of, need_mujoco, robot_of_spec
 from jaxid.case.robot import Robot, RobotJoint, body_in, kept, moved_by, projected
 from jaxid.errors import InputError
 from jaxid.export.exported import ExportedFile, JointLaws, need_joints, plant_of, shown
+from jaxid.export.mjcf_behind import BEHIND, BehindJoints
 from jaxid.export.mjcf_drives import DRIVE_EFFECTS, DriveText
 from jaxid.export.xml_text import Element, XmlText
 
@@ -70,8 +71,13 @@ def export_mjcf(model: Mapping[str, Any], path: Path) -> ExportedFile:
     found = bodies_of(plant_of(robot, model), robot.bodies, rotors)
     work.joints(file, found.rotors)
     work.bodies(found)
+    springs = BehindJoints(compiled, text, elements.joints, work.names, model)
+    springs.write()
+    work.notes.extend(springs.notes)
+    work.changed.extend(springs.changed)
     changed, notes = (*work.changed, *drives.changed), (*work.notes, *drives.notes)
-    return ExportedFile(text.text(), changed, notes, (*work.lost, *drives.lost), work.real)
+    lost, added = (*work.lost, *drives.lost), tuple(springs.added)
+    return ExportedFile(text.text(), changed, notes, lost, work.real, added)
 
 
 @dataclass
@@ -163,7 +169,7 @@ class _Work:
 
     def _laws(self) -> tuple[dict[str, float], ...]:
         """Return the effects that a joint of an MJCF has, by joint; name the others."""
-        laws = JointLaws.of(self.model, _LAWS, DRIVE_EFFECTS)
+        laws = JointLaws.of(self.model, _LAWS, (*DRIVE_EFFECTS, BEHIND))
         self._lose(laws.lost, "has no place in an MJCF")
         return laws.values
 

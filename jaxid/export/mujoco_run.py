@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,10 +33,12 @@ class Setting:
     Args:
         finer: Factor by which the time step of the file is shortened.
         stiff: Whether dry friction is as stiff as the time step allows, in place of the file's softness.
+        locked: Names of joints that stand still.
     """
 
     finer: int = 1
     stiff: bool = False
+    locked: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,18 +73,27 @@ class MujocoRobot:
         mujoco = need_mujoco(self.robot.file)
         model, period = self.model, replay.drive.period
         step, solref = float(model.opt.timestep), model.dof_solref.copy()
+        rotors = model.dof_armature.copy()
         count = max(1, round(period / step)) * setting.finer
         try:
             model.opt.timestep = period / count
             if setting.stiff:
                 model.dof_solref[:] = [2.0 * model.opt.timestep, 1.0]
+            for name in setting.locked:
+                model.dof_armature[model.joint(name).dofadr] = _HELD
             return _Run(mujoco, self, replay, count).positions()
         finally:
             model.opt.timestep, model.dof_solref[:] = step, solref
+            model.dof_armature[:] = rotors
 
 
 def load(
-    content: bytes, path: Path, names: list[str], held: dict[str, float], gravity: list[float]
+    content: bytes,
+    path: Path,
+    names: list[str],
+    held: dict[str, float],
+    gravity: list[float],
+    added: Sequence[str] = (),
 ) -> tuple[Any, Robot]:
     """Compile a robot's file beside the user's own, so that its parts are found.
 
@@ -92,6 +103,7 @@ def load(
         names: Names of the free joints that a result keeps.
         held: Positions of held joints.
         gravity: Acceleration of gravity in the base's frame [m/s^2].
+        added: Names of joints that move beside those of the result.
 
     Raises:
         InputError: If MuJoCo cannot read it.
@@ -111,7 +123,8 @@ def load(
     robot = kept(whole, names, held)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     model.opt.gravity[:] = gravity
-    stays = {model.joint(joint.name).id for joint in robot.joints if joint.name in _names(model)}
+    moves = [*added, *(joint.name for joint in robot.joints)]
+    stays = {model.joint(name).id for name in moves if name in _names(model)}
     for dof in range(model.nv):
         if int(model.dof_jntid[dof]) not in stays:
             model.dof_armature[dof], model.dof_frictionloss[dof] = _HELD, 0.0

@@ -105,10 +105,10 @@ def replay_export(
     found = found_machine(model, case, machine)
     replay, position = _simulated(found, measured)
 
-    def robot(content: bytes) -> MujocoRobot:
-        return _robot(content, path, model, case, found)
+    def robot(content: bytes, added: tuple[str, ...] = ()) -> MujocoRobot:
+        return _robot(content, path, model, case, found, added)
 
-    ours, theirs = robot(exported.content), robot(path.read_bytes())
+    ours, theirs = robot(exported.content, exported.added), robot(path.read_bytes())
     motion, before = ours.motion(replay), theirs.motion(replay)
     for what, values in (("the exported file", motion), ("your file", before)):
         if not np.all(np.isfinite(values)):
@@ -152,10 +152,17 @@ def _simulated(machine: Machine, log: Log) -> tuple[Replay, np.ndarray]:
     return replay, position
 
 
-def _robot(content: bytes, path: Path, model: Mapping[str, Any], case: Case, machine: Machine) -> MujocoRobot:
+def _robot(
+    content: bytes,
+    path: Path,
+    model: Mapping[str, Any],
+    case: Case,
+    machine: Machine,
+    added: tuple[str, ...] = (),
+) -> MujocoRobot:
     """Compile a file, and decide how the drives of a case act on it."""
     held = {name: float(value) for name, value in model["held"].items()}
-    compiled, robot = load(content, path, model["joints"], held, model["gravity_vector"])
+    compiled, robot = load(content, path, model["joints"], held, model["gravity_vector"], added)
     drives = machine.plant.driven(machine.plant.joints)
     by_joint = {drive.joint: drive for drive in robot.drives}
     of_file = [by_joint.get(model["joints"][joint]) for joint in drives]
@@ -185,6 +192,9 @@ def _costs(
         except InputError:
             continue
         yield f"without {shown(model['effects'][number])}", _rms(changed - position)
+    for name in exported.added:
+        stiff = robot.motion(replay, Setting(locked=(name,)))
+        yield f"without the second joint '{name}'", _rms(stiff - motion)
     fine = robot.motion(replay, Setting(finer=_FINER))
     yield f"time step of {robot.model.opt.timestep:g} s, against a {_FINER}th", _rms(fine - motion)
     if np.any(robot.model.dof_frictionloss > 0):

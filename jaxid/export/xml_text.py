@@ -52,6 +52,8 @@ class XmlText:
         # Insertions behind a start tag, and end tags of elements that had none, by the end of the start tag.
         self._inside: dict[int, list[bytes]] = {}
         self._closing: dict[int, bytes] = {}
+        self._before: dict[int, list[bytes]] = {}
+        self._behind: dict[int, list[bytes]] = {}
         # An element around the first one, so that there is always a last one open.
         whole = Element("", {}, 0, 0)
         stack = [whole]
@@ -87,9 +89,7 @@ class XmlText:
 
         An element that is written as one tag gets an end tag.
         """
-        line = self.content.rfind(b"\n", 0, element.start) + 1
-        indent = self.content[line : element.start]
-        indent = indent if not indent.strip() else b""
+        indent = self._indent(element)
         if element.end not in self._inside:
             self._inside[element.end] = []
             place = (element.start, element.end)
@@ -99,11 +99,39 @@ class XmlText:
                 self._closing[element.end] = b"\n" + indent + f"</{element.tag}>".encode()
         self._inside[element.end].append(b"\n" + indent + b"  " + text.encode())
 
+    def attribute(self, element: Element, name: str) -> str | None:
+        """Return an attribute of an element as it will be written; None if it has none."""
+        text = self._edits.get((element.start, element.end))
+        if text is None:
+            return element.attributes.get(name)
+        found = re.search(rf"\s{name}\s*=\s*[\"']([^\"']*)", text.decode())
+        return found and found[1]
+
+    def insert_before(self, element: Element, text: str) -> None:
+        """Insert text before an element, on a line of its own."""
+        self._before.setdefault(element.start, []).append(text.encode() + b"\n" + self._indent(element))
+
+    def _indent(self, element: Element) -> bytes:
+        line = self.content.rfind(b"\n", 0, element.start) + 1
+        indent = self.content[line : element.start]
+        return indent if not indent.strip() else b""
+
+    def insert_behind(self, element: Element, text: str) -> None:
+        """Insert text behind an element without children, on a line of its own."""
+        indent, end = self._indent(element), element.end
+        if not self.content[element.start : end].endswith(b"/>"):
+            end = self.content.index(b">", self.content.index(b"</", end)) + 1
+        self._behind.setdefault(end, []).append(b"\n" + indent + text.encode())
+
     def text(self) -> bytes:
         """Return the file with all changes."""
         edits = dict(self._edits)
         for end, texts in self._inside.items():
             edits[(end, end)] = b"".join(texts) + self._closing.get(end, b"")
+        for start, texts in self._before.items():
+            edits[(start, start)] = b"".join(texts)
+        for end, texts in self._behind.items():
+            edits[(end, end)] = b"".join(texts) + edits.get((end, end), b"")
         out = self.content
         for (start, end), new in sorted(edits.items(), reverse=True):
             out = out[:start] + new + out[end:]

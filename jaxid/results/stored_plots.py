@@ -15,6 +15,7 @@ from jaxid.results.report.data import LogView, ReportData
 from jaxid.results.report.force_plots import plot_forces, plot_frictions
 from jaxid.results.report.history_plots import plot_history
 from jaxid.results.report.numbers import is_number
+from jaxid.results.report.pose_plots import plot_poses
 from jaxid.results.report.profile_plots import plot_profiles
 from jaxid.results.report.telling import telling_variable
 from jaxid.results.report.words import where_region
@@ -165,6 +166,11 @@ def _profiles(chosen: Chosen) -> Figure | None:
     return plot_profiles(profiles) if profiles else None
 
 
+def _motion(chosen: Chosen) -> Figure | None:
+    poses = chosen.data.poses
+    return None if poses is None else plot_poses(poses)
+
+
 _DRAW: dict[str, Callable[[Chosen], Figure | None]] = {
     "forces": _forces,
     "residual": _residual,
@@ -176,6 +182,7 @@ _DRAW: dict[str, Callable[[Chosen], Figure | None]] = {
     "where": _where,
     "candidates": _candidates,
     "profiles": _profiles,
+    "motion": _motion,
 }
 
 

@@ -181,7 +181,7 @@ def test_each_picture_of_a_result(fitted, found, tmp_path, capsys):
                 assert picture.read_text().startswith("<?xml")
             else:
                 assert f"this result has no {kind} to draw" in ran.err
-    assert set(PICTURES) - drawn == {"history", "profiles"}
+    assert set(PICTURES) - drawn == {"history", "profiles", "motion"}
     ran = run(capsys, "plot", tmp_path / "fit.npz", "forces", "-o", tmp_path / "a.png", "--joint", 2)
     assert "joint 2 has no measured position; choose one of 1" in ran.err
 

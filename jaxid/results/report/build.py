@@ -15,6 +15,7 @@ from jaxid.model.units import joined
 from jaxid.results import as_json as results
 from jaxid.results.drive_chain import drive_chain
 from jaxid.results.friction_curve import friction_views
+from jaxid.results.poses import poses_of
 from jaxid.results.precision import precision_content, ratio_rows
 from jaxid.results.proposals import sentence
 from jaxid.results.report.data import (
@@ -152,6 +153,7 @@ def _common(result: Identification | Discovery, notes: Sequence[str], command: s
         "views": shown,
         "facts": run_facts(result, command),
         "chain": drive_chain(session, estimate.machine),
+        "poses": poses_of(session, session.fit, result.gaps[0]),
         "friction": friction_views(session, estimate, shown[:joints], incomplete=incomplete),
     }
 

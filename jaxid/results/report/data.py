@@ -169,6 +169,27 @@ class ExperimentView:
 
 
 @dataclass(frozen=True, eq=False)
+class PoseStrip:
+    """An arm at some instants of a log, as a stick figure.
+
+    Args:
+        name: Name of the log.
+        time: Instants [s], (F,).
+        bones: Pairs of points between which a line is drawn.
+        measured: Places of the base, the joints and the ends by measured positions [m], (F, P, 3).
+        simulated: The same by simulated positions; None without a simulation.
+        up: Direction against gravity in the base's frame, (3,).
+    """
+
+    name: str
+    time: np.ndarray
+    bones: tuple[tuple[int, int], ...]
+    measured: np.ndarray
+    simulated: np.ndarray | None
+    up: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class FrictionView:
     """The friction of one joint over its velocity.
 
@@ -267,6 +288,7 @@ class ReportData:
         facts: Pairs of a name and a text: machine, date, command, method, settings, log.
         chain: Parts of the drive chain, from the controller to the load.
         friction: Friction over velocity, by joint.
+        poses: Poses of an arm along the fitted log; None for a machine without geometry.
     """
 
     title: str
@@ -302,3 +324,4 @@ class ReportData:
     facts: tuple[tuple[str, str], ...] = ()
     chain: tuple[ChainPart, ...] = ()
     friction: tuple[FrictionView, ...] = ()
+    poses: PoseStrip | None = None

@@ -20,6 +20,7 @@ from jaxid.results.report.figure_tables import tables_of
 from jaxid.results.report.force_plots import plot_forces, plot_frictions
 from jaxid.results.report.history_plots import plot_history
 from jaxid.results.report.numbers import is_number, nats, pretty_unit, short
+from jaxid.results.report.pose_plots import plot_poses, pose_table
 from jaxid.results.report.profile_plots import plot_profiles
 from jaxid.results.report.telling import telling_variable
 
@@ -76,6 +77,7 @@ def render(data: ReportData) -> str:
         notes=[tables.unbroken(note) for note in data.notes],
         where_figure=_where_figure(data),
         history=_history(data),
+        poses=_poses(data),
         precision=_precision(data),
         experiments=[_experiment(data, view) for view in data.experiments],
         main=None if main is None else _beside(entries[main], telling),
@@ -216,6 +218,17 @@ def _history(data: ReportData) -> dict | None:
     if data.history is None:
         return None
     return _picture("Estimates and running residual over time", plot_history, data.history, data.units)
+
+
+def _poses(data: ReportData) -> dict | None:
+    """Return the figure of an arm at instants of the log, with the places of its end as a table."""
+    if data.poses is None:
+        return None
+    words = f"{data.poses.name}: the arm at {len(data.poses.time)} instants, from the side and from above"
+    wide = with_narrow(
+        image(plot_poses(data.poses), words), plot_poses(data.poses, size=(4.6, 7.0), columns=4)
+    )
+    return {**wide, "tables": (pose_table(data.poses),)}
 
 
 def _precision(data: ReportData) -> dict | None:
