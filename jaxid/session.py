@@ -219,7 +219,8 @@ def open_session(
                 where = f"{case.where}, [[validation]] {entry.name}"
                 own = own_values(case, machine, entry.name, entry.known, measured.period, where)
             at = machine if own is None else own.machine(machine)
-            run = _run(name, measured, at, recipe, needed, entry.disturbance)
+            beside = _enough_beside(measured, at, short)
+            run = _run(name, measured, at, recipe, beside, entry.disturbance)
             opened.append(replace(run, reference_hold=entry.columns.reference_hold, own=own))
             names.add(name)
     for extra in validate:
@@ -228,14 +229,8 @@ def open_session(
         name = _unlike(Path(measured.source).stem, names)
         names.add(name)
         own = OwnValues(name) if several else None
-        run = _run(
-            name,
-            measured,
-            machine if own is None else own.machine(machine),
-            recipe,
-            needed,
-            machine.disturbance,
-        )
+        at = machine if own is None else own.machine(machine)
+        run = _run(name, measured, at, recipe, _enough_beside(measured, at, short), machine.disturbance)
         opened.append(replace(run, own=own))
     if first.own is not None and not more:
         machine = first.own.machine(machine)
@@ -442,7 +437,12 @@ def _opened(
     at = machine if source.own is None else source.own.machine(machine)
     findings = _check(case, log, at, short, alone=False)
     run = _run(
-        source.name, log, at, _recipe_of(log, case, recipe), 0 if short else enough(at), source.disturbance
+        source.name,
+        log,
+        at,
+        _recipe_of(log, case, recipe),
+        _enough_beside(log, at, short),
+        source.disturbance,
     )
     return replace(run, reference_hold=source.reference_hold, own=source.own), findings
 
@@ -749,6 +749,14 @@ def _run(
 ) -> OpenedLog:
     log = recipe.cleaned(log)
     return OpenedLog(name, log, _prepare(log, machine, recipe, needed), disturbance)
+
+
+def _enough_beside(log: Log, machine: Machine, short: bool) -> int:
+    """Return the least number of moving samples of a log beside the first.
+
+    The position of a loop whose force was not logged tells, or confirms, that a joint stands still.
+    """
+    return 0 if short or machine.unforced(log) else enough(machine)
 
 
 def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepared:

@@ -97,7 +97,8 @@ def scale_group(machine: Machine, log: Log) -> tuple[int, ...]:
     """
     law = machine.controller
     names = next((names for kind, names in _GAINS.items() if type(law) is kind), None)
-    if names is None:
+    if names is None or machine.disturbance is not None:
+        # Another law is not linear in its gains, and a disturbance is a known force.
         return ()
     free = machine.parameters.free
     unknown = {f.path[1] for f in free if f.path[0] == CONTROLLER}

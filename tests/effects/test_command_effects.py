@@ -139,8 +139,9 @@ def test_the_slope_by_a_limit_of_the_acceleration_is_exact(name):
     def run(limit):
         return accelerated(target, limit, PERIOD)[:, 0]
 
-    slope = jax.jvp(run, (jnp.asarray(40.0),), (jnp.ones(()),))[1]
-    apart = (run(40.0 + 1e-5) - run(40.0 - 1e-5)) / 2e-5
+    # At some limits a piece ends at a tick, and the two sides have slopes of their own; not at this one.
+    slope = jax.jvp(run, (jnp.asarray(39.3),), (jnp.ones(()),))[1]
+    apart = (run(39.3 + 1e-6) - run(39.3 - 1e-6)) / 2e-6
     assert np.abs(slope).max() > 1e-3
     np.testing.assert_allclose(slope, apart, atol=1e-8)
 
