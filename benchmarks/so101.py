@@ -2,8 +2,8 @@
 
     JAXID_DATA=FOLDER python -m benchmarks.so101 [--joint N]... [-o DIR]
 
-Each joint is an axis behind a servo of unknown gains, and is fitted by `identify` to stretches of four
-motions. The fitted model then follows the eight other motions from their commands. Beside it stand the
+Each joint is an axis behind a servo of unknown gains, and is fitted by `identify` to stretches of six
+motions. The fitted model then follows the six other motions from their commands. Beside it stand the
 community's MJCF, replayed by MuJoCo, and a simulation that goes where it is told. Writes so101.json,
 so101.md and so101.svg.
 """
@@ -34,9 +34,18 @@ JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 # so fast a loop is all but continuous for these gains.
 ROW, TICKS = 0.02006, 4
 # Stretches that are fitted, all of one length, so that they share compiled code; others are left out.
-FITTED = {"chirp_sweep": 3999, "friction_gravity": 0, "multisine": 0, "prbs_excitation": 0}
+FITTED = {
+    "chirp_sweep": 3999,
+    "friction_gravity": 0,
+    "hold_under_gravity": 0,
+    "multisine": 0,
+    "prbs_excitation": 0,
+    "single_joint_elbow": 0,
+}
 ROWS = 2001
-# Motions in which the arm touches the table: joints at rest by their command are pushed out of place.
+# Least travel of the command of a joint that is fitted to a motion [rad].
+MOVES = 0.05
+# Motions in which the arm touches the table: joints whose command rests are pushed out of place.
 TOUCHING = ("hold_under_gravity", "single_joint_elbow")
 # The motion whose joints are faster than the limit of acceleration that the chirp shows allows; its command
 # jumps between two values. Why the servo has no limit there is not known.
@@ -58,17 +67,6 @@ def columns(motion: np.ndarray, name: str) -> np.ndarray:
     return np.stack([motion[f"{name}{k}"] for k in range(1, 7)], axis=1)
 
 
-def weights(model: mujoco.MjModel, motion: np.ndarray) -> np.ndarray:
-    """Return the torque of the weight on all joints in the commanded poses [N m], (rows, 6)."""
-    state, commands = mujoco.MjData(model), columns(motion, "cmd")
-    out = np.empty_like(commands)
-    for k, pose in enumerate(commands):
-        state.qpos[:] = pose
-        mujoco.mj_forward(model, state)
-        out[k] = -state.qfrc_bias
-    return out
-
-
 def rollout(model: mujoco.MjModel, motion: np.ndarray) -> np.ndarray:
     """Return the positions at which MuJoCo has the joints, (rows, 6), from the first reading at rest."""
     state, commands = mujoco.MjData(model), columns(motion, "cmd")
@@ -82,23 +80,18 @@ def rollout(model: mujoco.MjModel, motion: np.ndarray) -> np.ndarray:
     return out
 
 
-def case_of(joint: int) -> dict[str, Any]:
-    """Return the case of one joint, 1-based; its guesses are those of any small servo."""
-    weighed = joint in (2, 3)
-    case: dict[str, Any] = {
-        "plant": {
-            "kind": "axis",
-            "motion": "rotary",
-            # Without a weight nothing gives a scale: the file's inertia of the rotor does.
-            "parameters": {"inertia": {"guess": 0.03} if weighed else 0.028},
-        },
+def case_of() -> dict[str, Any]:
+    """Return the case of one joint; its guesses are those of any small servo."""
+    return {
+        # Command and encoder have no scale: the file's inertia of the rotor, behind its gear, gives it.
+        "plant": {"kind": "axis", "motion": "rotary", "parameters": {"inertia": 0.028}},
         "effects": [
             {"kind": "viscous_friction", "coefficient": {"guess": 0.8}},
             {"kind": "coulomb_friction", "level": {"guess": 0.2}},
             {"kind": "stribeck_friction", "level": {"guess": 0.1}, "velocity": {"guess": 0.1}},
-            *([{"kind": "load_friction", "coefficient": {"guess": 0.2}}] if weighed else []),
+            # The weight at about one pose.
             {"kind": "constant_force", "level": {"guess": 0.0}},
-            {"kind": "acceleration_limit", "limit": {"guess": 60.0}},
+            {"kind": "acceleration_limit", "limit": {"guess": 50.0}},
         ],
         "controller": {
             "kind": "pd",
@@ -108,22 +101,13 @@ def case_of(joint: int) -> dict[str, Any]:
             "limit": {"guess": 3.0},
             "period": ROW / TICKS,
         },
-        "log": {
-            "time": "t",
-            "position": "q",
-            "reference": "r",
-            "reference_hold": "zero_order",
-        },
-        "fit": [],
+        "log": {"time": "t", "position": "q", "reference": "r", "reference_hold": "zero_order"},
     }
-    if weighed:
-        case["controller"]["disturbance"] = "weight"
-    return case
 
 
-def run(joint: int, logs: dict[str, np.ndarray], weight: dict[str, np.ndarray]) -> dict[str, Any]:
+def run(joint: int, logs: dict[str, np.ndarray]) -> dict[str, Any]:
     """Fit one joint, 1-based, and follow the motions left out; return the record."""
-    case = case_of(joint)
+    case = {**case_of(), "fit": []}
     never = {"acceleration_limit.limit": 1e9}
     with tempfile.TemporaryDirectory() as folder:
         for name, motion in logs.items():
@@ -131,13 +115,12 @@ def run(joint: int, logs: dict[str, np.ndarray], weight: dict[str, np.ndarray]) 
                 "t": ROW * np.arange(len(motion)),
                 "q": motion[f"q{joint}"],
                 "r": motion[f"cmd{joint}"],
-                "weight": weight[name][:, joint - 1],
             }
             path = Path(folder) / f"{name}.csv"
             np.savetxt(
                 path, np.stack(list(table.values()), 1), "%.9g", ",", header=",".join(table), comments=""
             )
-            if name in FITTED:
+            if name in FITTED and np.ptp(table["r"]) > MOVES:
                 entry = {"name": name, "log": str(path), "rows": [FITTED[name], FITTED[name] + ROWS]}
                 case["fit"].append({**entry, "set": never} if name == WITHOUT_LIMIT else entry)
         begin = time.perf_counter()
@@ -146,7 +129,7 @@ def run(joint: int, logs: dict[str, np.ndarray], weight: dict[str, np.ndarray]) 
         left = {
             name: followed(result.estimate.machine, Path(folder) / f"{name}.csv")
             for name in logs
-            if name not in FITTED
+            if name not in {entry["name"] for entry in case["fit"]}
         }
     fitted = {gap.name: gap.simulation for gap in result.gaps}
     shown = {}
@@ -214,7 +197,7 @@ def table(content: dict[str, Any]) -> str:
         "",
         f"Written by `python -m benchmarks.so101` on {content['date']}, at {content['commit']}.",
         "Figures are RMS of simulated minus measured position in mrad; a count of the encoder is 1.5.",
-        f"Fitted: {ROWS} rows each of {', '.join(FITTED)}, as far as the joint is moved.",
+        f"Fitted: {ROWS} rows each of {', '.join(FITTED)}, where the joint moves.",
         f"Left out: {', '.join(left)}.",
         "",
         "| joint | left out | fitted motions | left out, community's MJCF | left out, as commanded | s |",
@@ -231,9 +214,16 @@ def table(content: dict[str, Any]) -> str:
         *averaged, _ = np.mean(rows, axis=0)
         total = sum(row[-1] for row in rows)
         lines.append(f"| **mean** | {' | '.join(f'**{x:.1f}**' for x in averaged)} | {total:.0f} |")
-    lines += ["", "By motion:", "", f"| joint | {' | '.join(left)} |", "|---" * (len(left) + 1) + "|"]
+    lines += [
+        "",
+        f"In {' and '.join(TOUCHING)} the arm touches the table, which a joint alone does not know.",
+    ]
+    lines += ["", "By motion:", "", f"| joint | {' | '.join([*left, *FITTED])} |"]
+    lines.append("|---" * (len(names) + 1) + "|")
     for joint, record in sorted(joints.items()):
-        cells = ["diverges" if record["rms"][n] is None else f"{record['rms'][n]:.1f}" for n in left]
+        cells = [
+            "diverges" if record["rms"][n] is None else f"{record['rms'][n]:.1f}" for n in [*left, *FITTED]
+        ]
         lines.append(f"| {JOINTS[joint - 1]} | {' | '.join(cells)} |")
     lines += ["", "Values (σ):", "", f"| | {' | '.join(JOINTS[j - 1] for j in sorted(joints))} |"]
     lines.append("|---" * (len(joints) + 1) + "|")
@@ -261,11 +251,10 @@ def main() -> None:
     model = mujoco.MjModel.from_xml_path(str(data / "so101.xml"))
     model.opt.timestep = STEP
     logs = motions(data)
-    weight = {name: weights(model, motion) for name, motion in logs.items()}
     if "compared" not in content or not args.joint:
         content["compared"] = compared(model, logs)
     for joint in args.joint or range(1, len(JOINTS) + 1):
-        record = run(joint, logs, weight)
+        record = run(joint, logs)
         content["joints"] = [r for r in content["joints"] if r["joint"] != joint] + [record]
         content |= {"commit": commit_of(ROOT), "date": date.today().isoformat()}
         kept.write_text(json.dumps(content, indent=1) + "\n")

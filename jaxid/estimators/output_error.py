@@ -44,7 +44,7 @@ from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE
 from jaxid.numerics import filters as signals
 from jaxid.numerics.kept import kept_jit
-from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.numerics.lanes import SolveRequest, Steps, run_alone, solved_together
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, Rows, assess_together, full_hessian, hessian_notes
 from jaxid.simulation.kalman import rounded_readings
@@ -67,6 +67,8 @@ _CLEARLY = 10.0
 _DIVERGED = "the simulation diverged from these starting values"
 # Part of the cost by which a fit of several logs has converged, and its most evaluations, as of one log.
 _TOLERANCE, _MOST = 1e-12, 60
+# Logs from which on those of one length are simulated side by side; fewer are so with those of other runs.
+_MANY = 4
 
 
 @kept_jit
@@ -385,9 +387,19 @@ class _Fit:
         self, theta: np.ndarray, starts: np.ndarray, signals: Sequence[float], weights: np.ndarray
     ) -> Steps[list[Rows]]:
         logs, p, q = [], theta.size, theta.size + starts.size
-        for output, place, signal, weight in zip(self.outputs, self.places, signals, weights, strict=True):
-            request = SolveRequest(_linearised, (*output.arguments(theta, starts[place]), self.on))
-            e, jacobian = (np.asarray(x) for x in (yield request))
+        requests = [
+            SolveRequest(_linearised, (*output.arguments(theta, starts[place]), self.on))
+            for output, place in zip(self.outputs, self.places, strict=True)
+        ]
+        if len(requests) < _MANY:
+            answers = []
+            for request in requests:
+                answers.append((yield request))
+        else:
+            answers = yield from solved_together(requests)
+        of_logs = zip(self.outputs, self.places, signals, weights, answers, strict=True)
+        for output, place, signal, weight, answer in of_logs:
+            e, jacobian = (np.asarray(x) for x in answer)
             wide = np.zeros((*e.shape, q))
             own = output.part.index.size
             wide[..., output.part.index] = jacobian[..., :own]
