@@ -101,6 +101,8 @@ def case_of() -> dict[str, Any]:
             "limit": {"guess": 3.0},
             "period": ROW / TICKS,
         },
+        # A count of the encoder is 1.534 mrad.
+        "sensor": {"position_noise": 1.534e-3 / 12**0.5},
         "log": {"time": "t", "position": "q", "reference": "r", "reference_hold": "zero_order"},
     }
 
