@@ -53,7 +53,7 @@ WITHOUT_LIMIT = "prbs_excitation"
 # Step of MuJoCo [s].
 STEP = 0.002
 # Part of a motion left out that the picture shows: motion, joint, first and last row.
-SHOWN = (("step_response", 3, 1500, 2000), ("wave_motion", 5, 500, 1000))
+SHOWN = (("step_response", 3, 550, 2050), ("wave_motion", 5, 500, 1000))
 
 
 def motions(data: Path) -> dict[str, np.ndarray]:

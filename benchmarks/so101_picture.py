@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 # Size of the picture and of a panel, and places of the first panel [units of the view box].
-WIDTH, HEIGHT, PANEL = 840, 640, 210
-LEFT, RIGHT, TOP, GAP = 70, 20, 96, 62
+WIDTH, HEIGHT, PANEL = 840, 660, 204
+LEFT, RIGHT, TOP, GAP = 70, 24, 100, 88
+# Most points of a curve.
+POINTS = 500
 # Curves from back to front: key, words, colour, width.
 CURVES = (
     ("file", "the file that people use", "#d9822b", 3.0),
@@ -54,7 +56,7 @@ def legend() -> str:
             f"<path d='M{x} 36h34' stroke='{colour}' stroke-width='{width + 1}' stroke-linecap='round'/>"
         )
         out.append(text(words, x + 44, 44, "start", 24))
-        x += 44 + 13 * len(words) + 28
+        x += 44 + 11 * len(words) + 40
     return "\n".join(out)
 
 
@@ -83,13 +85,14 @@ def panel(words: str, curves: dict[str, Float[np.ndarray, " rows"]], row: float,
         at = float(y(mark))
         out.append(f"<path d='M{LEFT} {at:.1f}H{WIDTH - RIGHT}' stroke='#e3e3e3' stroke-width='1.5'/>")
         out.append(text(f"{mark:g}°", LEFT - 10, at + 8, "end", 22))
-    for second in range(0, int(count * row) + 1, 2):
-        out.append(text(f"{second} s", float(x(second / row)), top + PANEL + 26, "middle", 22))
+    apart = next(s for s in (2, 5, 10, 20) if count * row / s < 6)
+    for second in range(0, int(count * row) + 1, apart):
+        at = min(float(x(second / row)), WIDTH - RIGHT - 8.0)
+        out.append(text(f"{second} s", at, top + PANEL + 28, "middle", 22))
     for key, _, colour, width in CURVES:
         if key in curves:
-            points = " ".join(
-                f"{a:.1f},{b:.1f}" for a, b in zip(x(np.arange(count)), y(curves[key]), strict=True)
-            )
+            some = np.arange(0, count, -(-count // POINTS))
+            points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x(some), y(curves[key][some]), strict=True))
             out.append(
                 f"<polyline points='{points}' fill='none' stroke='{colour}' stroke-width='{width}' "
                 "stroke-linejoin='round' stroke-linecap='round'/>"
