@@ -261,8 +261,8 @@ def main() -> None:
         content |= {"commit": commit_of(ROOT), "date": date.today().isoformat()}
         kept.write_text(json.dumps(content, indent=1) + "\n")
         (args.o / "so101.md").write_text(table(content))
+        (args.o / "so101.svg").write_text(picture(content, SHOWN, JOINTS, ROW))
         print(table(content).split("By motion")[0], flush=True)
-    (args.o / "so101.svg").write_text(picture(content, SHOWN, JOINTS, ROW))
 
 
 if __name__ == "__main__":
