@@ -17,7 +17,7 @@ from jaxid.machine import Machine
 from jaxid.model.by_name import Place, parameters_by_name
 from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
-from jaxid.model.unknowns import Free, Parameters, of_log, scatter
+from jaxid.model.unknowns import CONTROLLER, Free, Parameters, of_log, scatter, scatter_controller
 from jaxid.schema import Spot, number
 
 # Prefix of the values of [controller] among those that a log sets.
@@ -53,7 +53,7 @@ class OwnValues:
         free: list[Free] = []
         for f in machine.parameters.free:
             place = (f.path, f.index)
-            if place in self.plant:
+            if place in self.plant or (f.path[0] == CONTROLLER and f.path[1] in self.controller):
                 continue
             if f.log is None:
                 free.append(f)
@@ -66,7 +66,9 @@ class OwnValues:
         controller = self._controller(machine.controller)
         if not values and controller is machine.controller and len(free) == len(machine.parameters.free):
             return machine
-        plant = scatter(tuple(values), machine.plant, np.array(list(values.values())))
+        places, numbers = tuple(values), np.array(list(values.values()))
+        plant = scatter(places, machine.plant, numbers)
+        controller = scatter_controller(places, controller, numbers)
         return replace(
             machine,
             plant=plant,

@@ -89,6 +89,44 @@ class CommandLag(_OnCommand):
         return [{"time_constant": s} for s in _times(scales)]
 
 
+@register("acceleration_limit")
+class AccelerationLimit(_OnCommand):
+    """Profile generator in front of the controller, which follows the command with a limited acceleration.
+
+    Each command is the target of a point-to-point motion from the profile's present position and velocity:
+    it speeds up by at most `limit`, and slows down so as to stop at the target. The profile has its steps
+    at the ticks of the controller; see `jaxid.numerics.delays.accelerated`.
+    """
+
+    title = "a command that is followed with a limited acceleration"
+    formula = "|d²r/dt²| ≤ limit, r being the command of the controller, which stops at the reference"
+    met = "servos with a profile of motion of their own, such as Feetech's and Dynamixel's"
+    part = "controller"
+
+    controller_field = "acceleration"
+    of_reference = True
+    # A command of any machine is far slower.
+    elsewhere = 1e9
+
+    limit: Array = parameter("position/time2", "positive", "largest acceleration of the profile")
+
+    def curve(self) -> tuple[str, str, np.ndarray, np.ndarray]:
+        # A step of one, which takes 2 / sqrt(limit): half of the time to speed up, half to slow down.
+        half = float(self.limit) ** -0.5
+        time = np.linspace(-0.4, 2.4, 241) * half
+        since = np.clip(time / half, 0.0, 2.0)
+        reached = np.where(since < 1.0, 0.5 * since**2, 1.0 - 0.5 * (2.0 - since) ** 2)
+        return *_AFTER_A_STEP, time, reached
+
+    @classmethod
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"limit": cls.elsewhere}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"limit": scales.acceleration * s} for s in (1.0, 2.0, 4.0, 8.0)]
+
+
 @register("dead_band")
 class DeadBand(_OnCommand):
     """The controller takes a position error below `width` for none, and a larger one as it is.

@@ -83,11 +83,14 @@ def _output_error(
         "hessian": demands.hessian if hessian is None else hessian,
         "profile": demands.profile if profile is None else profile,
     }
-    if session.machine.unforced(log):
-        return (yield from _unforced(session, on, minimiser, numerics, precision))
-    start = yield from _start(session)
-    options = {"numerics": numerics, "solver": solver, "on": on, "minimiser": minimiser, **precision}
     need_no_profile(session, precision["profile"])
+    options = {"numerics": numerics, "on": on, "minimiser": minimiser, **precision}
+    if session.machine.unforced(log):
+        from jaxid.estimators.unforced import unforced_steps
+
+        return (yield from unforced_steps(session, **options))
+    start = yield from _start(session)
+    options["solver"] = solver
     logs = parts_of(session) if session.more else log
     result = yield from output_error_steps(session.machine, logs, start=start, **options)
     result = replace(result, notes=(*result.notes, *_doubts_of_output_error(session)))
@@ -100,36 +103,6 @@ def _output_error(
     # Without an encoder on every joint inverse dynamics may end far off, especially with coarse readings.
     other = yield from output_error_steps(session.machine, log, **options)
     return min((result, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
-
-
-def _unforced(
-    session: Session,
-    on: str,
-    minimiser: str | Minimiser | None,
-    numerics: Numerics | None,
-    precision: dict[str, Any],
-) -> Steps[Estimate]:
-    """Fit the position of a loop whose force was not logged, from several starts."""
-    from jaxid.estimators.output_error import output_error_steps
-    from jaxid.estimators.simulated_output import choose_numerics
-    from jaxid.estimators.unforced import base_of, coarse_starts, scale_group, with_free_scale, without
-
-    machine, log = session.machine, session.fit.log
-    group = scale_group(machine, log)
-    base = base_of(machine, group) if group else None
-    fitted = machine if base is None else without(machine, base)
-
-    fits = []
-    for start in coarse_starts(fitted, log, numerics or choose_numerics(fitted, log)):
-        fits.append(
-            (
-                yield from output_error_steps(
-                    fitted, log, start=start, numerics=numerics, on=on, minimiser=minimiser, **precision
-                )
-            )
-        )
-    result = min(fits, key=lambda e: (not e.converged, np.nansum(e.residual**2)))
-    return result if base is None else with_free_scale(result, machine, group, base)
 
 
 def _doubts_of_output_error(session: Session) -> list[str]:
@@ -439,11 +412,12 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
     need_one_log(session, method)
     if method != "output_error":
         need_force(session, method)
-    elif any(session.machine.unforced(run.log) for run in session.fits):
-        session.need_one_log("a fit without a force")
+    else:
+        need_alike(session)
     need_position(method, session.fit.log)
     if method not in ("output_error", "within_prior") or session.more:
         need_known_reference(session, f"{method} takes them as they are")
+    if method != "output_error" and (method != "within_prior" or session.more):
         why = (
             "does not take them with several logs" if session.more else "does not simulate the loop with them"
         )
@@ -559,6 +533,22 @@ def need_force(session: Session, what: str) -> None:
                 where=run.log.source,
                 hint="fit by output_error, which simulates the loop",
             )
+
+
+def need_alike(session: Session) -> None:
+    """Refuse logs with and without a force in one fit.
+
+    Raises:
+        InputError: If some of the fitted logs hold a force and others do not.
+    """
+    unforced = [session.machine.unforced(run.log) for run in session.fits]
+    if any(unforced) and not all(unforced):
+        lacking = session.fits[unforced.index(True)].name
+        raise InputError(
+            f"the log {lacking} has no force, and others have one",
+            where=session.case.where,
+            hint="leave force out of [log] to fit all of them by their positions",
+        )
 
 
 def need_known_controller(session: Session, why: str) -> None:

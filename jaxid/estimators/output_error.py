@@ -44,7 +44,7 @@ from jaxid.model.plant import Plant
 from jaxid.model.unknowns import REFERENCE
 from jaxid.numerics import filters as signals
 from jaxid.numerics.kept import kept_jit
-from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
+from jaxid.numerics.lanes import SolveRequest, Steps, run_alone, solved_together
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, Rows, assess_together, full_hessian, hessian_notes
 from jaxid.simulation.kalman import rounded_readings
@@ -67,6 +67,8 @@ _CLEARLY = 10.0
 _DIVERGED = "the simulation diverged from these starting values"
 # Part of the cost by which a fit of several logs has converged, and its most evaluations, as of one log.
 _TOLERANCE, _MOST = 1e-12, 60
+# Logs from which on those of one length are simulated side by side; fewer are so with those of other runs.
+_MANY = 4
 
 
 @kept_jit
@@ -375,7 +377,17 @@ class _Fit:
             return (yield from descent_steps(evaluate, x, scale.bounds, **options))
 
         x = scale.inward(theta, starts)
-        found, weights = yield from descended_steps(fit, x, weights)
+        if self.unforced:
+            # Without a force the model may be far from complete. Its errors have a colour that is none of the
+            # noise, and would make a log count for nothing: readings then weigh alike.
+            alike = np.full(len(self.outputs), 1.0 / np.mean(1.0 / weights))
+            found = yield from fit(x, alike)
+            x = found.x
+        if not self.unforced or (found.model.finite and self.noise_limited(found.model.content)):
+            found, weights = yield from descended_steps(fit, x, weights)
+        elif found.model.finite:
+            weights = _pooled(found.model.content)
+            found = yield from fit(x, weights)
         model, finite = found.model, bool(np.isfinite(found.model.cost))
         failure = _DIVERGED if not finite else f"no convergence within {found.steps} steps"
         ended = (weights, found.converged and finite, failure, found.steps)
@@ -385,15 +397,38 @@ class _Fit:
         self, theta: np.ndarray, starts: np.ndarray, signals: Sequence[float], weights: np.ndarray
     ) -> Steps[list[Rows]]:
         logs, p, q = [], theta.size, theta.size + starts.size
-        for output, place, signal, weight in zip(self.outputs, self.places, signals, weights, strict=True):
-            request = SolveRequest(_linearised, (*output.arguments(theta, starts[place]), self.on))
-            e, jacobian = (np.asarray(x) for x in (yield request))
+        requests = [
+            SolveRequest(_linearised, (*output.arguments(theta, starts[place]), self.on))
+            for output, place in zip(self.outputs, self.places, strict=True)
+        ]
+        if len(requests) < _MANY:
+            answers = []
+            for request in requests:
+                answers.append((yield request))
+        else:
+            answers = yield from solved_together(requests)
+        of_logs = zip(self.outputs, self.places, signals, weights, answers, strict=True)
+        for output, place, signal, weight, answer in of_logs:
+            e, jacobian = (np.asarray(x) for x in answer)
             wide = np.zeros((*e.shape, q))
             own = output.part.index.size
             wide[..., output.part.index] = jacobian[..., :own]
             wide[..., p + place.start : p + place.stop] = jacobian[..., own:]
             logs.append(Rows(wide, e, output.counts, signal, float(weight)))
         return logs
+
+    @property
+    def unforced(self) -> bool:
+        """True if no log holds the force that drives its loop."""
+        return all(o.part.machine.unforced(o.part.log) for o in self.outputs)
+
+    def noise_limited(self, logs: Sequence[Rows]) -> bool:
+        """Check that what is left of every log is at most a few times the noise of its readings."""
+        for output, log in zip(self.outputs, logs, strict=True):
+            rms = np.sqrt(np.sum(np.square(log.residual)) / max(int(log.counts.sum()), 1))
+            if rms > _NOISE_LIMITED * np.max(position_noise(output.part.machine, output.part.log)):
+                return False
+        return True
 
     def hessian(self, end: _End) -> Steps[np.ndarray]:
         """Compute the full Hessian of half the weighted sum of squares by the active unknowns."""
@@ -603,6 +638,9 @@ def _without_noise(
         np.minimum(position_noise(o.part.machine, o.part.log), signals.high_band_std(o.part.log.readings))
         for o in fit.outputs
     ]
+    if fit.unforced and not fit.noise_limited(end.logs):
+        # Errors of the model move the estimates more, and hide how the noise does.
+        return end.theta, precision, []
     looped = all(o.looped for o in fit.outputs) and not any(o.part.log.integrated for o in fit.outputs)
     if not looped or not end.converged or not any(np.any(std > 0) for std in noise):
         return end.theta, precision, []
@@ -620,6 +658,12 @@ def _without_noise(
     )
     precision = replace(precision, covariance=precision.covariance + shift.covariance[:p, :p])
     return theta, precision, [note]
+
+
+def _pooled(logs: Sequence[Rows]) -> np.ndarray:
+    """Return one over the mean square of all residuals, as the weight of each log."""
+    squares = sum(float(np.sum(np.square(log.residual))) for log in logs)
+    return np.full(len(logs), sum(int(log.counts.sum()) for log in logs) / max(squares, 1e-300))
 
 
 def _failure(minimum: Minimum, minimiser: str | Minimiser | None) -> str:

@@ -7,34 +7,85 @@ the others are given relative to it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-import scipy.stats
-from jaxtyping import Float
 
-from jaxid.arrays import Array
 from jaxid.consistency.absent import without_scale
 from jaxid.controllers.linear import PD, PID, CascadePD
+from jaxid.estimators.coarse_starts import coarse_starts
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.simulated_output import choose_numerics, output_residual, position_jacobian
+from jaxid.estimators.output_error import output_error_steps
+from jaxid.estimators.several.parts import Part, parts_of
+from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.model.plant import Plant
 from jaxid.model.unknowns import CONTROLLER, Parameters
+from jaxid.numerics.lanes import Steps
 from jaxid.numerics.precision import Precision, assess
-from jaxid.simulation.replay import Numerics, Replay, make_replay
+from jaxid.simulation.replay import Numerics
 from jaxid.simulation.sensor_noise import position_noise
 
-# Points of the coarse search, their spread about the guesses as a factor, and lanes of a compiled call.
-_POINTS, _SPREAD, _LANES = 512, 6.0, 64
-# Longest delay that the search tries if its guess is zero [s].
-_LONGEST = 0.1
+if TYPE_CHECKING:
+    from jaxid.session import Session
+
+# Starts from which logs that are fitted together are fitted; each fit simulates all of them many times.
+_STARTS_TOGETHER = 2
 # Keys of each law that give its command a scale; without one that is known, the scale is free.
 _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
+
+
+def unforced_steps(session: Session, *, numerics: Numerics | None = None, **options: Any) -> Steps[Estimate]:
+    """Fit the positions of loops whose force was not logged, from several starts, to one log or to several.
+
+    Args:
+        session: Case and logs of the fit.
+        numerics: Settings of the integration; None: chosen from machine and log.
+        options: Further arguments of `output_error_steps`.
+    """
+    machine = session.machine
+    group = common_scale_group(machine, parts_of(session))
+    base = base_of(machine, group) if group else None
+    fitted = machine if base is None else without(machine, base)
+    parts = parts_of(session.with_machine(fitted))
+    chosen = [numerics or choose_numerics(part.machine, part.log) for part in parts]
+
+    starts = coarse_starts(fitted, parts, chosen)
+    if len(parts) > 1:
+        starts = starts[:_STARTS_TOGETHER]
+    fits = []
+    for start in starts:
+        fits.append((yield from output_error_steps(fitted, parts, start=start, numerics=numerics, **options)))
+    result = min(fits, key=lambda e: (not e.converged, _cost(e)))
+    return result if base is None else with_free_scale(result, machine, group, base)
+
+
+def _cost(estimate: Estimate) -> float:
+    """Return the squared residual; that of each log of several is divided by its noise."""
+    logs = list(estimate.details.get("fits", {}).values())
+    if not logs:
+        return float(np.nansum(estimate.residual**2))
+    samples = [log["samples"] for log in logs]
+    # Each log counts by its own noise, so that the likelihood is that of the sum of these logarithms.
+    return float(np.dot(samples, [2 * np.log(max(log["noise"], 1e-300)) for log in logs]))
+
+
+def common_scale_group(machine: Machine, parts: Sequence[Part]) -> tuple[int, ...]:
+    """Return the unknowns that may all be multiplied by one factor in logs that are fitted together.
+
+    Args:
+        machine: Machine of all logs at its guesses.
+        parts: The logs; what is known in one of them gives all of them their scale.
+    """
+    names: set[str] = set()
+    for part in parts:
+        own = [part.machine.parameters.names[k] for k in scale_group(part.machine, part.log)]
+        if not own:
+            return ()
+        names |= set(own)
+    return tuple(k for k, name in enumerate(machine.parameters.names) if name in names)
 
 
 def scale_group(machine: Machine, log: Log) -> tuple[int, ...]:
@@ -46,7 +97,8 @@ def scale_group(machine: Machine, log: Log) -> tuple[int, ...]:
     """
     law = machine.controller
     names = next((names for kind, names in _GAINS.items() if type(law) is kind), None)
-    if names is None:
+    if names is None or machine.disturbance is not None:
+        # Another law is not linear in its gains, and a disturbance is a known force.
         return ()
     free = machine.parameters.free
     unknown = {f.path[1] for f in free if f.path[0] == CONTROLLER}
@@ -65,8 +117,9 @@ def scale_group(machine: Machine, log: Log) -> tuple[int, ...]:
 def base_of(machine: Machine, group: tuple[int, ...]) -> int:
     """Return the unknown to hold: an inertia if there is one, which a user may find elsewhere."""
     free = machine.parameters.free
-    of_plant = [k for k in group if free[k].effect is None and free[k].path[0] != CONTROLLER]
-    return (of_plant or list(group))[0]
+    of_all = [k for k in group if free[k].log is None] or list(group)
+    of_plant = [k for k in of_all if free[k].effect is None and free[k].path[0] != CONTROLLER]
+    return (of_plant or of_all)[0]
 
 
 def without(machine: Machine, base: int) -> Machine:
@@ -167,52 +220,3 @@ def precision_at_guesses(machine: Machine, log: Log) -> Precision:
         np.where(guess != 0, guess, 1.0),
     )
     return precision if base is None else free_precision(precision, machine, group, base)
-
-
-def coarse_starts(
-    machine: Machine, log: Log, numerics: Numerics, count: int = 3
-) -> list[Float[np.ndarray, " p"]]:
-    """Return starts of a fit: the guesses, and the best of many points about them in simulation.
-
-    The points are a Sobol sequence in the logarithms of the unknowns that must be positive, within a factor
-    of six of their guesses. A delay is tried from zero on. Unknowns of free sign stay at their guesses.
-
-    Args:
-        machine: The machine with its guesses.
-        log: The log.
-        numerics: Settings of the integration.
-        count: Number of points beside the guesses.
-    """
-    unknown = machine.parameters
-    guess, (lower, upper) = unknown.guess, unknown.bounds
-    delays = np.array([f.path[0] == CONTROLLER and f.path[1] == "delay" for f in unknown.free])
-    moved = np.array([f.sign != "free" for f in unknown.free]) & ((guess > 0) | delays)
-    if not moved.any():
-        return [guess]
-    sampler = scipy.stats.qmc.Sobol(int(moved.sum()), scramble=False)
-    draws = sampler.random(_POINTS)
-    points = np.tile(guess, (_POINTS, 1))
-    points[:, moved] = guess[moved] * _SPREAD ** (2 * draws - 1)
-    longest = np.maximum(_SPREAD * guess, _LONGEST)
-    for k in np.flatnonzero(delays):
-        points[:, k] = longest[k] * draws[:, int(np.sum(moved[:k]))]
-    points = np.clip(points, lower, upper)
-
-    replay = make_replay(machine, log, numerics)
-    measured = jnp.asarray(log.filled)
-    weight = jnp.asarray(np.array(log.measured, float)) * jnp.ones(measured.shape)
-    parts = [
-        np.asarray(_costs(replay, unknown.places, machine.plant, measured, weight, points[k : k + _LANES]))
-        for k in range(0, _POINTS, _LANES)
-    ]
-    costs = np.nan_to_num(np.concatenate(parts), nan=np.inf)
-    best = np.argsort(costs, kind="stable")[:count]
-    return [guess, *points[best]]
-
-
-@eqx.filter_jit
-def _costs(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, points: Array
-) -> Array:
-    residual = output_residual(replay, places, plant, measured, weight)
-    return jax.vmap(lambda theta: jnp.sum(jnp.square(residual(theta))))(points)

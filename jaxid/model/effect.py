@@ -170,6 +170,8 @@ class Effect(eqx.Module):
     needs_drive: ClassVar[bool] = False
     # Field of the controller that its only parameter sets; None: it does not act on the controller.
     controller_field: ClassVar[str | None] = None
+    # Value of that field at a drive without the effect.
+    elsewhere: ClassVar[float] = 0.0
     # Whether that field is one of the reference, which every law follows.
     of_reference: ClassVar[bool] = False
     # Field of the controller of which it is the same further along the drive; None: there is none.

@@ -1,4 +1,4 @@
-"""Delays and lags of sampled signals, with a derivative by the delay and by the lag."""
+"""Delays, lags and limited accelerations of sampled signals, with derivatives by their parameters."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.numerics.smooth import sharp_clip
 
 
 def shifted(signal: Float[Array, "time m"], shift: Array, ahead: int = 0) -> Float[Array, "time m"]:
@@ -63,3 +64,36 @@ def lagged(signal: Float[Array, "time m"], part: Array) -> Float[Array, "time m"
         return new, new
 
     return jax.lax.scan(follow, jnp.asarray(signal[0], float), signal)[1]
+
+
+def accelerated(signal: Float[Array, "time m"], limit: Array, period: float) -> Float[Array, "time m"]:
+    """Follow a signal with a limited acceleration, so as to stop at its present value without overshoot.
+
+    At each sample the profile has the largest velocity from which it can stop at the signal, as far as the
+    limit lets it change: the trapezoidal, or triangular, course of a point-to-point motion, with a new target
+    at every sample. It starts at rest at the first sample. All pieces are joined continuously, so that
+    derivatives by signal and limit are those of the pieces.
+
+    Args:
+        signal: Target at the samples, (time, m).
+        limit: Largest acceleration, above zero, one for all columns or one each [unit of the signal / s^2].
+        period: Time between two samples [s].
+
+    Returns:
+        The profile at the samples, (time, m).
+    """
+    gain = limit * period
+
+    def follow(state: tuple[Array, Array], target: Array) -> tuple[tuple[Array, Array], Array]:
+        now, speed = state
+        away = target - now
+        # Braking by `gain` a sample from v takes v^2 / (2 limit) + v period / 2.
+        near = jnp.abs(away) <= gain * period
+        root = jnp.sqrt(0.25 * gain**2 + 2.0 * limit * jnp.where(near, 0.0, jnp.abs(away)))
+        wanted = jnp.where(near, away / period, jnp.sign(away) * (root - 0.5 * gain))
+        speed = speed + sharp_clip(wanted - speed, gain)
+        now = now + period * speed
+        return (now, speed), now
+
+    first = jnp.asarray(signal[0], float)
+    return jax.lax.scan(follow, (first, jnp.zeros_like(first) * gain), signal)[1]

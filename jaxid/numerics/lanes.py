@@ -186,6 +186,25 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     return [ended[k] for k in range(len(many))]
 
 
+def solved_together(requests: Sequence[SolveRequest]) -> Steps[list[Any]]:
+    """Solve many requests of one run, equal ones in one compiled call, and return their answers in order."""
+    groups: dict[Any, list[int]] = {}
+    arrays: list[list[np.ndarray]] = []
+    for k, asked in enumerate(requests):
+        key, own = _parted(asked)
+        groups.setdefault(key, []).append(k)
+        arrays.append(own)
+    answers: list[Any] = [None] * len(requests)
+    for key, group in groups.items():
+        if len(group) == 1:
+            answers[group[0]] = yield requests[group[0]]
+            continue
+        found = _solved(key, [arrays[k] for k in group], len(group))
+        for k, answer in zip(group, found, strict=True):
+            answers[k] = answer
+    return answers
+
+
 def _parted(asked: SolveRequest) -> tuple[Any, list[np.ndarray]]:
     """Return the key that is common to runs solved together, and the arrays of this run."""
     leaves, structure = jax.tree.flatten(asked.args)

@@ -20,7 +20,14 @@ from jaxid.own_values import OwnValues, expanded, own_values
 from jaxid.session.against_case import hold_against_case
 from jaxid.session.checks import log_findings, parts_left_out
 from jaxid.session.opened import Logs, OpenedLog, Session
-from jaxid.session.preparing import enough, open_log, recipe_of, under_hold, with_velocity_scale
+from jaxid.session.preparing import (
+    enough,
+    enough_beside,
+    open_log,
+    recipe_of,
+    under_hold,
+    with_velocity_scale,
+)
 from jaxid.session.reading import at_joints, read_at_joints, with_reference
 from jaxid.session.sources import Source, between_gaps, one_table, pieces_of, sources_of, unlike
 from jaxid.settings import LogTable
@@ -84,7 +91,6 @@ def open_session(
         case=case,
         machine=machine,
         recipe=recipe,
-        needed=needed,
         short=short,
         several=several,
         findings=findings,
@@ -127,7 +133,6 @@ class _Opening:
         case: The case for logs of the joints.
         machine: Machine at the guesses, with the unknowns of all logs.
         recipe: Filtering of the first log.
-        needed: Samples of motion that a log to validate on must have.
         short: Whether a fit within a prior can do with a short log.
         several: Whether several logs are fitted.
         findings: Warnings on the logs; those on each further log are added.
@@ -137,7 +142,6 @@ class _Opening:
     case: Case
     machine: Machine
     recipe: Recipe
-    needed: int
     short: bool
     several: bool
     findings: list[Finding]
@@ -188,7 +192,7 @@ class _Opening:
                         log,
                         self.machine,
                         self.recipe,
-                        self.needed,
+                        enough_beside(log, self.machine, self.short),
                         entry.disturbance,
                         values=values,
                         reference_hold=entry.columns.reference_hold,
@@ -210,7 +214,8 @@ class _Opening:
             names.add(name)
             values = OwnValues(name) if self.several else None
             machine, disturbance = self.machine, self.machine.disturbance
-            opened.append(open_log(name, log, machine, self.recipe, self.needed, disturbance, values=values))
+            needed = enough_beside(log, machine, self.short)
+            opened.append(open_log(name, log, machine, self.recipe, needed, disturbance, values=values))
         return opened
 
     def _read(self, log: LogLike, columns: LogTable | None = None, *, whole: bool = False) -> Log:
@@ -222,7 +227,7 @@ class _Opening:
         on_log = source.machine(self.machine)
         findings = log_findings(self.case, log, on_log, self.short, alone=False)
         recipe = recipe_of(log, self.case, self.recipe)
-        opened = _open_source(source, log, self.machine, recipe, 0 if self.short else enough(on_log))
+        opened = _open_source(source, log, self.machine, recipe, enough_beside(log, on_log, self.short))
         self.findings.extend(findings)
         return opened
 

@@ -46,6 +46,14 @@ def enough(machine: Machine) -> int:
     return 5 * max(len(machine.parameters.free), 4)
 
 
+def enough_beside(log: Log, machine: Machine, short: bool) -> int:
+    """Return the least number of moving samples of a log beside the first.
+
+    The position of a loop whose force was not logged shows, or confirms, that a joint stands still.
+    """
+    return 0 if short or machine.unforced(log) else enough(machine)
+
+
 def open_log(
     name: str,
     log: Log,

@@ -109,6 +109,7 @@ def test_missing_dry_friction_is_named(text):
 
 HIDDEN = {
     "command_lag": {"time_constant": 0.03},
+    "acceleration_limit": {"limit": 15.0},
     "dead_band": {"width": 0.02},
     "load_friction": {"coefficient": 0.25},
     "stribeck_friction": {"level": 0.02, "velocity": 0.3},

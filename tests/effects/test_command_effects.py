@@ -11,9 +11,10 @@ from jaxid.controllers import CONTROLLERS, with_effects
 from jaxid.controllers.base import Tick
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
+from jaxid.numerics.delays import accelerated
 from jaxid.numerics.smooth import outside
 from jaxid.plants import Axis
-from truth.axis.stepper import Loop, Machine, Sensor, simulate
+from truth.axis.stepper import Loop, Machine, Sensor, profile, simulate
 
 PERIOD = 1e-3
 AS_EFFECT = {"command_delay": ("delay", 0.0123), "dead_band": ("width", 0.02)}
@@ -93,6 +94,63 @@ def test_a_lag_from_zero_has_a_slope():
     at_zero, slope = jax.jvp(passed, (jnp.zeros(()),), (jnp.ones(()),))
     np.testing.assert_array_equal(at_zero, reference[:, 0])
     np.testing.assert_allclose(slope[1:], -np.diff(reference[:, 0]) / PERIOD, rtol=1e-12)
+
+
+def targets(steps: int = 1500) -> dict[str, np.ndarray]:
+    """A step, steps while the profile moves, and a sine that asks for more than the limit."""
+    t = PERIOD * np.arange(steps)
+    return {
+        "step": 0.24 * (t > 0.01),
+        "steps": 0.24 * (t > 0.01) - 0.3 * (t > 0.08) + 0.1 * (t > 0.4),
+        "sine": 0.15 * np.sin(2 * np.pi * 3.0 * t),
+    }
+
+
+def test_a_step_is_followed_by_a_triangle_of_velocities():
+    target = targets()["step"]
+    got = np.asarray(accelerated(jnp.asarray(target)[:, None], jnp.asarray(40.0), PERIOD))[:, 0]
+    half = np.sqrt(0.24 / 40.0)
+    # The first step is taken at the tick of the command, and each moves by the velocity at its end.
+    t = PERIOD * (np.arange(target.size) - np.argmax(target > 0) + 1.5)
+    up, down = 20.0 * t**2, 0.24 - 20.0 * (2 * half - t) ** 2
+    exact = np.where(t < 0, 0.0, np.where(t < half, up, np.where(t < 2 * half, down, 0.24)))
+    np.testing.assert_allclose(got, exact, atol=1e-4)
+    assert np.abs(np.diff(got, 2)).max() < 40.0 * PERIOD**2 * (1 + 1e-9)
+    assert got[-1] == 0.24
+
+
+@pytest.mark.parametrize("name", ["steps", "sine"])
+def test_a_profile_of_new_targets_is_the_time_optimal_one(name):
+    """By bang-bang steps a fiftieth as long; the profile of ticks is ahead by one and a half of them."""
+    target = targets()[name]
+    got = np.asarray(accelerated(jnp.asarray(target)[:, None], jnp.asarray(40.0), PERIOD))[:, 0]
+    exact = profile(target, 40.0, 1 / PERIOD)
+    ticks = np.arange(target.size)
+    ahead = np.interp(ticks + 1.5, ticks, exact)
+    assert np.abs(target - exact).max() > 0.1
+    # The two see a moving target at instants up to half a tick apart.
+    assert np.abs(got - ahead)[:-2].max() < 0.5 * PERIOD * np.abs(np.gradient(exact, PERIOD)).max()
+
+
+@pytest.mark.parametrize("name", ["step", "steps", "sine"])
+def test_the_slope_by_a_limit_of_the_acceleration_is_exact(name):
+    target = jnp.asarray(targets()[name])[:, None]
+
+    def run(limit):
+        return accelerated(target, limit, PERIOD)[:, 0]
+
+    # At some limits a piece ends at a tick, and the two sides have slopes of their own; not at this one.
+    slope = jax.jvp(run, (jnp.asarray(39.3),), (jnp.ones(()),))[1]
+    apart = (run(39.3 + 1e-6) - run(39.3 - 1e-6)) / 2e-6
+    assert np.abs(slope).max() > 1e-3
+    np.testing.assert_allclose(slope, apart, atol=1e-8)
+
+
+def test_a_limit_that_no_command_reaches_changes_nothing():
+    """It stands at drives without the effect, and where a search begins."""
+    target = jnp.asarray(targets()["steps"])[:, None]
+    limit = jnp.asarray(EFFECTS["acceleration_limit"].elsewhere)
+    np.testing.assert_allclose(accelerated(target, limit, PERIOD), target, rtol=0, atol=1e-15)
 
 
 def test_an_error_in_the_dead_band_counts_as_none():

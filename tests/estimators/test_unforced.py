@@ -140,6 +140,57 @@ def test_a_method_of_forces_is_refused(method):
         jaxid.identify(tomllib.loads(known), log(), method=method)
 
 
-def test_two_logs_at_once_are_refused():
-    with pytest.raises(InputError, match="a fit without a force takes one log, not 2"):
-        jaxid.identify(tomllib.loads(CASE), [log(), log(seed=1)])
+PAYLOAD = """
+[[effects]]
+kind = "added_mass"
+mass = 0.0
+[[fit]]
+name = "empty"
+log = "empty.csv"
+[[fit]]
+name = "loaded"
+log = "loaded.csv"
+set = { "added_mass.mass" = 1e-3 }
+"""
+
+
+def saved(folder, **logs: dict[str, np.ndarray]) -> list:
+    """Write logs as CSV files and return their paths."""
+    paths = []
+    for name, given in logs.items():
+        paths.append(folder / f"{name}.csv")
+        columns = np.stack(list(given.values()), axis=1)
+        np.savetxt(paths[-1], columns, "%.10g", ",", header=",".join(given), comments="")
+    return paths
+
+
+def test_one_log_without_its_force_beside_one_with_it_is_refused(tmp_path):
+    """A file whose force is zero throughout counts as none."""
+    u = {"a": np.sin(TIME), "b": np.zeros(TIME.size)}
+    logs = saved(tmp_path, **{name: log() | {"u": force} for name, force in u.items()})
+    text = CASE.replace("{ guess = 0.02 }", "0.05").replace("{ guess = 0.005 }", "0.02") + 'force = "u"\n'
+    with pytest.raises(InputError, match="force"):
+        jaxid.identify(tomllib.loads(text), logs, method="output_error")
+
+
+@pytest.mark.slow
+def test_two_logs_tell_more_than_one():
+    both, one = jaxid.identify(tomllib.loads(CASE), [log(), log(seed=1)]), identify(CASE, log())
+    assert both.estimate.converged
+    for name, true in TRUE.items():
+        found = both.parameters[name]
+        assert abs(found.value - true) < 4 * found.std, name
+        assert found.std < 0.9 * one.parameters[name].std, name
+    assert [gap.name for gap in both.gaps] == [run.name for run in both.session.fits]
+
+
+@pytest.mark.slow
+def test_a_payload_that_is_known_gives_the_scale(tmp_path):
+    """Without it the same two logs have none."""
+    saved(tmp_path, empty=log(), loaded=log(added_mass={"mass": 1e-3}))
+    (tmp_path / "case.toml").write_text(FREE + PAYLOAD)
+    result = jaxid.identify(tmp_path / "case.toml")
+    for name, true in {**TRUE, "controller.kp": 2.0}.items():
+        found = result.parameters[name]
+        assert found.identifiable, name
+        assert abs(found.value - true) < 4 * found.std, name

@@ -55,7 +55,14 @@ EFFECTS = {
     "load_friction": {"coefficient": "gear", "back": "gear_back"},
 }
 # Effects between the reference and the law, with their parameter.
-ON_COMMAND = {"command_delay": "delay", "command_lag": "time_constant", "dead_band": "width"}
+ON_COMMAND = {
+    "command_delay": "delay",
+    "command_lag": "time_constant",
+    "acceleration_limit": "limit",
+    "dead_band": "width",
+}
+# Steps of a profile with limited acceleration in a tick.
+PROFILE_STEPS = 50
 KINDS = {
     "open_loop": kernel.OPEN,
     "cascade_pd": kernel.CASCADE_PD,
@@ -194,10 +201,10 @@ def control_law(loop: Loop) -> kernel.Law:
 
 
 def reached(reference: np.ndarray, machine: Machine, rate: float) -> np.ndarray:
-    """Return what reaches the law of a reference [m], behind the delay and the lag of the command.
+    """Return what reaches the law of a reference [m], behind delay, lag and profile of the command.
 
     The delayed reference is joined by lines; the lag is the low-pass y[k] = a r[k] + (1 - a) y[k-1] that has
-    settled at the first reference, with a = h / (T + h).
+    settled at the first reference, with a = h / (T + h). See `profile` for a limited acceleration.
     """
     delay, constant = (
         machine.effects.get(kind, {}).get(ON_COMMAND[kind], 0.0) for kind in ("command_delay", "command_lag")
@@ -205,7 +212,30 @@ def reached(reference: np.ndarray, machine: Machine, rate: float) -> np.ndarray:
     t = np.arange(len(reference)) / rate
     out = np.interp(t - delay, t, reference)
     a = 1.0 / (1.0 + constant * rate)
-    return scipy.signal.lfilter([a], [1.0, a - 1.0], out - out[0]) + out[0]
+    lagged = scipy.signal.lfilter([a], [1.0, a - 1.0], out - out[0]) + out[0]
+    limit = machine.effects.get("acceleration_limit", {}).get("limit")
+    return lagged if limit is None else profile(lagged, limit, rate)
+
+
+def profile(target: np.ndarray, limit: float, rate: float) -> np.ndarray:
+    """Return the course that follows a target, held from tick to tick, with a limited acceleration.
+
+    It is bang-bang: it pushes towards the target until only full braking stops there, and then brakes. From
+    rest at the first target; integrated in steps of a small part of a tick.
+    """
+    h = 1.0 / rate / PROFILE_STEPS
+    out, x, v = np.empty(len(target)), float(target[0]), 0.0
+    for k, goal in enumerate(target):
+        out[k] = x
+        for _ in range(PROFILE_STEPS):
+            away = goal - x
+            if abs(away) < limit * h**2 and abs(v) < 2 * limit * h:
+                x, v = goal, 0.0
+                break
+            ahead = away - v * abs(v) / (2 * limit)
+            a = limit if ahead > 0 else -limit
+            x, v = x + h * (v + 0.5 * h * a), v + h * a
+    return out
 
 
 def first_samples(values: np.ndarray | None, count: int, what: str) -> np.ndarray:
