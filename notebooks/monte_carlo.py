@@ -55,11 +55,12 @@ study = jaxid.study(case)
 print(study)
 
 # %% [markdown]
-# The table of all runs is an xarray Dataset, `study.table`; `study.summary` has the counts.
+# `spread` is the scatter of the estimates, `std` the mean of the standard deviations that the fits
+# reported; they should agree. `coverage_95` is the share of 95 % intervals that hold the truth.
 
 # %%
 rows = study.to_pandas()
-rows
+rows[["estimator", "parameter", "unit", "true", "bias", "spread", "std", "coverage_95"]].round(3)
 
 # %%
 study.plot("coverage", parameter="inertia")
@@ -68,8 +69,8 @@ plt.show()
 # %% [markdown]
 # ## Count by hand
 #
-# The same from the runs themselves: an interval of 1.96 standard deviations holds the truth, or
-# not.
+# All runs are in an xarray Dataset, `study.table`. An interval of 1.96 standard deviations holds the
+# truth, or not.
 
 # %%
 table = study.table
