@@ -172,12 +172,3 @@ fitted = jax.jit(
 sigmas = np.asarray((fitted.theta - theta) / fitted.std)
 for name, value, std, true in zip(free, fitted.theta, fitted.std, theta, strict=True):
     print(f"{name:30s} {value:.6f} ± {std:.6f}, true {true}")
-
-# %% [markdown]
-# The Hessian H of the sum of squares gives the same standard deviations: the covariance is 2 s² / H, with
-# s the noise of 5 mrad.
-
-# %%
-by_hessian = np.sqrt(np.diag(2 * 5e-3**2 * np.linalg.inv(hessian)))
-for name, std, other in zip(free, fitted.std, by_hessian, strict=True):
-    print(f"{name:30s} {std:.2e} by the fit, {other:.2e} by the Hessian")

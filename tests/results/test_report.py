@@ -1,5 +1,7 @@
 """The report: it stands alone, holds the numbers, and copes with what is absent."""
 
+import base64
+import hashlib
 import html
 import re
 import subprocess
@@ -119,11 +121,23 @@ def page():
     return render(_discovery())
 
 
+def _without_script(page: str) -> str:
+    """The page without its one script, which its policy allows by the digest."""
+    [code] = re.findall(r"<script>(.*?)</script>", page, re.S)
+    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+    assert (
+        f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'" in page
+    )
+    rest = page.replace(f"<script>{code}</script>", "")
+    assert "<script" not in rest
+    return rest
+
+
 def test_the_page_stands_alone(page):
+    page = _without_script(page)
     assert page.lstrip().startswith("<!DOCTYPE html>")
     assert "http://" not in page
     assert "https://" not in page
-    assert "<script" not in page
     targets = re.findall(r'(?:src|href|srcset)="([^"]*)"', page)
     assert targets
     assert all(target.startswith(("#", "data:image/")) for target in targets)
@@ -186,8 +200,7 @@ def test_hostile_names_are_escaped():
         notes=(bad,),
         versions={bad: bad},
     )
-    page = render(data)
-    assert "<script" not in page
+    page = _without_script(render(data))
     assert page.count("&lt;script&gt;") >= 12
 
 
