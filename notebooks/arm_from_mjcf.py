@@ -105,8 +105,9 @@ result = jaxid.identify(case, log, method="inverse_dynamics")
 print(result)
 
 # %% [markdown]
-# What is left is largest where a joint turns back. Dry friction in MuJoCo is soft: at very low speed
-# it creeps, where the friction of jaxid holds.
+# The residual over velocity has no pattern: nothing is missing. Without `"armature"` in the list the
+# model would be incomplete, because the file's value of the elbow is wrong. The armature of the
+# shoulder acts like the inertia of its link, so that the log shows their sum only.
 
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(12, 3.2), layout="constrained")

@@ -93,6 +93,6 @@ result.plot("scatter", against="velocity")
 plt.show()
 
 # %% [markdown]
-# The period gives the inertia of one joint in one configuration, here 1 to 2 % too large. Identification
-# gives friction too, and from one log. The page [PA-10](../docs/evidence/pa10.md) goes on to the whole arm, its
-# drive and the method's failure.
+# The period gives the inertia of one joint in one configuration, here 1 to 2 % too large.
+# Identification gives friction too, and from one log. The page [PA-10](../docs/evidence/pa10.md) goes
+# on to the whole arm, its drive and the method's failure.

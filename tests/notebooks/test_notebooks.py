@@ -75,9 +75,11 @@ assert off.size >= 20 and np.mean(abs(off) < 1.96) >= 0.79, off
 """,
     "arm_from_mjcf": """
 assert status == 0
-assert np.all(torque_off["found"] < 0.1 * torque_off["file"]), torque_off
+assert result.model_complete
+assert np.all(torque_off["found"] < 0.01 * torque_off["file"]), torque_off
 assert len(friction_names) == 4
-assert np.allclose([result.value(n) for n in friction_names], true_friction, rtol=0.1)
+assert np.allclose([result.value(n) for n in friction_names], true_friction, rtol=0.01)
+assert abs(result.value("rotor_inertia[2]") / TRUE["a2"] - 1) < 0.02
 assert np.allclose([by_urdf.value(n) / result.value(n) for n in friction_names], 1, rtol=1e-3)
 """,
     "monte_carlo": """

@@ -112,7 +112,7 @@ def _identification(**changes):
 
 def _words(page):
     """The page's text as a reader sees it."""
-    body = page[page.index("<body>") :].replace("<wbr>", "")
+    body = page[page.index("<body>") :].partition("<script>")[0].replace("<wbr>", "")
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).replace("\u00a0", " ").split())
 
 
