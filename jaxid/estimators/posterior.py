@@ -65,7 +65,7 @@ def posterior_chains(session: Session, estimate: Estimate, *, draws: int, chains
     fitted = np.asarray(problem.transform.outward(end.x[:p]))
 
     # The noise that rests at a bound is known.
-    free = np.concatenate([np.ones(p, bool), noise_between_bounds(problem, end.x[p:])])
+    free = np.concatenate([np.ones(p, bool), noise_between_bounds(problem, np.asarray(end.x[p:]))])
     rows, logs = (
         np.hstack([np.asarray(problem.transform.physical(a[:, :p], fitted)), a[:, p:]])[:, free]
         for a in (np.asarray(a).reshape(-1, end.x.size) for a in (end.mean, end.log_variance))

@@ -84,7 +84,12 @@ def _edges(band: PolyCollection) -> list[dict]:
         if size < _FEWEST:
             continue
         edges = corners[1 : size + 1], corners[size + 2 : 2 * size + 2][::-1]
-        shown = {"label": "", "color": to_hex(band.get_facecolor()[0]), "dots": False, "dashed": True}
+        shown = {
+            "label": "",
+            "color": to_hex(tuple(np.atleast_2d(np.asarray(band.get_facecolor()))[0])),
+            "dots": False,
+            "dashed": True,
+        }
         out += [shown | {"at": _packed(edge[:, 0]), "value": _packed(edge[:, 1])} for edge in edges]
     return out
 
