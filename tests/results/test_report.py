@@ -251,6 +251,14 @@ def test_gap_of_several_joints_and_logs():
     assert "force, joint 2 validation: fast 0.600 N m" in words
 
 
+def test_joints_of_unlike_units_are_not_put_in_one_range():
+    gap = {"unit": ["N", "N m", "N m", "N"], "fit": [6.1, 0.5, 0.7, 2.0], "noise_floor": [5.0, 0.4, 0.6, 2.0]}
+    words = _words(render(_identification(views=(), gap=gap)))
+    assert "of joints 1 and 4 on the fit log is 2.00–6.10 N (RMS), at noise floors of 2.00–5.00 N." in words
+    assert "of joints 2 and 3 on the fit log is 0.500–0.700 N m (RMS)" in words
+    assert "4 joints" not in words
+
+
 def test_logs_are_not_mixed_in_the_answer():
     """Steps of a search hold one number for all joints, of the other log."""
     gap = {"unit": "N", "before": [4.1, 3.5], "after": [1.0, 0.02], "noise_floor": [1.0, 0.016]}

@@ -150,7 +150,7 @@ def _friction(data: ReportData) -> dict | None:
     drawn = image(plot_frictions(data.friction, data.units), words)
     if len(data.friction) > 1:
         drawn = with_narrow(drawn, plot_frictions(data.friction, data.units, columns=1))
-    sampled = any(view.force_measured is not None for view in data.friction)
+    sampled = any(view.force_measured is not None and len(view.force_measured) for view in data.friction)
     return {"title": words, "wide": len(data.friction) > 1, "sampled": sampled} | drawn
 
 
