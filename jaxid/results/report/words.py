@@ -313,7 +313,7 @@ def _change(before: str, after: str, old: float | None, new: float | None) -> st
 
 
 def _gaps_words(quantity: str, rows: Sequence[GapRow], every: bool = True) -> str:
-    """Return the gaps of several joints of one unit as ranges; the joints are named unless it is every one."""
+    """Return the gaps of several joints of one unit as ranges; unless it is every joint, they are named."""
     numbers = [x for r in rows for x in (r.before, r.after, r.floor) if is_number(x)]
     scale, unit = scaled_unit(rows[0].unit, numbers)
 
