@@ -80,5 +80,5 @@ for noise in (0.0, 1e-8, 1e-7, 1e-6):
     print(f"{1e9 * noise:7.0f} nm" + "".join(f"{100 * error:16.3f} %" for error in noisy[noise].values()))
 
 # %% [markdown]
-# Errors grow in proportion to the noise. The page [a chain of masses](../docs/evidence/chain.md) has a
-# thousand runs of each method and level.
+# Errors grow with the noise. The page [a chain of masses](../docs/evidence/chain.md) has a thousand
+# runs of each method and level.
