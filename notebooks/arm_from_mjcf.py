@@ -15,8 +15,7 @@
 #
 # A robot's file has guesses of masses, armature and friction. MuJoCo simulates the real arm here:
 # jaxid gets only its log and a file with wrong values. At the end the corrected file is run in
-# MuJoCo again. The URDF way is the same with `urdf =` in place of `mjcf =`; the last cells
-# show it.
+# MuJoCo again. The last cells do the same with a URDF.
 #
 # Needs `pip install 'jaxid[mujoco]'`.
 
@@ -80,14 +79,17 @@ def moved(text, seconds=6.0, seed=0):
 rows = moved(MODEL.format(**TRUE))
 log = dict(zip(("t", "q1", "q2", "u1", "u2"), rows[:, :5].T, strict=True))
 plt.figure(figsize=(9, 2.5), layout="constrained")
-plt.plot(log["t"], log["q1"], log["t"], log["q2"])
+plt.plot(log["t"], log["q1"], label="shoulder")
+plt.plot(log["t"], log["q2"], label="elbow")
+plt.xlabel("time [s]")
 plt.ylabel("position [rad]")
+plt.legend()
 plt.show()
 
 # %% [markdown]
 # ## Identify
 #
-# `unknown` names what of the file is to be identified: sums of the link parameters, and
+# `unknown` says which values of the file are to be identified: sums of the link parameters, and
 # everything that CAD does not have.
 
 # %%
@@ -95,12 +97,23 @@ case = {
     "plant": {
         "kind": "tree",
         "mjcf": str(folder / "robot.xml"),
-        "unknown": ["base", "damping", "frictionloss"],
+        "unknown": ["base", "armature", "damping", "frictionloss"],
     },
     "log": {"time": "t", "position": ["q1", "q2"], "force": ["u1", "u2"]},
 }
 result = jaxid.identify(case, log, method="inverse_dynamics")
 print(result)
+
+# %% [markdown]
+# The residual over velocity has no pattern: nothing is missing. Without `"armature"` in the list the
+# model would be incomplete, because the file's value of the elbow is wrong. The armature of the
+# shoulder acts like the inertia of its link, so that the log shows their sum only.
+
+# %%
+figure, axes = plt.subplots(1, 2, figsize=(12, 3.2), layout="constrained")
+for joint in (1, 2):
+    result.plot("scatter", axes[joint - 1], against="velocity", joint=joint)
+plt.show()
 
 # %% [markdown]
 # ## Back into the file
@@ -134,8 +147,7 @@ for name, value in zip(friction_names, true_friction, strict=True):
 # %% [markdown]
 # ## The same from a URDF
 #
-# A URDF has no armature. The rotor inertia is then part of the sums that are identified, and the
-# friction comes out the same.
+# A URDF has no armature, so the fit starts from zero. The friction comes out the same.
 
 # %%
 URDF = """
@@ -157,7 +169,7 @@ URDF = """
 case["plant"] = {
     "kind": "tree",
     "urdf": str(folder / "robot.urdf"),
-    "unknown": ["base", "damping", "frictionloss"],
+    "unknown": ["base", "armature", "damping", "frictionloss"],
 }
 by_urdf = jaxid.identify(case, log, method="inverse_dynamics")
 for name in friction_names:

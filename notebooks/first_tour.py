@@ -85,8 +85,8 @@ print(jaxid.check(case_file, log_file))
 # ## Fit the declared model
 #
 # `identify` fits the unknowns to the log and judges the fit on a second one, which the case names.
-# By default it fits the simulated position. This loop is stiff and holds the position within
-# micrometres whatever friction does, so here the force says more: `inverse_dynamics` fits that.
+# Without `method` jaxid chooses one, and says why. The tour takes `inverse_dynamics`: it is the fastest,
+# and it fits the force, which we look at below.
 
 # %%
 declared = jaxid.identify(case_file, log_file, method="inverse_dynamics")

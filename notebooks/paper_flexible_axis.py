@@ -60,7 +60,8 @@ both
 # ## The motor's encoder alone
 #
 # `minimal_model` eliminates the motion of the load, as the paper does. It can only give the two
-# Coulomb frictions as a sum, and says so.
+# Coulomb frictions as a sum, and says so. It needs derivatives of fourth order, which amplify noise: the
+# first line and the notes of the result say how much remains unexplained.
 
 # %%
 motor = fitted("motor", "minimal_model", load=False)

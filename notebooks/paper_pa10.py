@@ -33,8 +33,8 @@ from experiments.pa10_joint import COULOMB, INERTIA, NOISE, VISCOUS, settled, sw
 # %% [markdown]
 # ## A limit cycle
 #
-# Coulomb friction is overcompensated and viscous friction undercompensated: the joint swings at
-# one amplitude.
+# Coulomb friction is overcompensated and viscous friction undercompensated: after some time the joint
+# swings at a constant amplitude.
 
 # %%
 log = swinging(200.0, 0.3, duration=20.0)
@@ -93,6 +93,6 @@ result.plot("scatter", against="velocity")
 plt.show()
 
 # %% [markdown]
-# The period gives the inertia of one joint in one configuration. Identification gives friction
-# too, and from one log. The page [PA-10](../docs/evidence/pa10.md) goes on to the whole arm, its
-# drive and the method's failure.
+# The period gives the inertia of one joint in one configuration, here 1 to 2 % too large.
+# Identification gives friction too, and from one log. The page [PA-10](../docs/evidence/pa10.md) goes
+# on to the whole arm, its drive and the method's failure.

@@ -63,7 +63,8 @@ for direction in directions:
     print(f"{direction['std']:.3f} of the prior: {parts}")
 
 # %% [markdown]
-# The friction of motor and table acts as one sum at the motor. Of the truth, and as found:
+# The friction of motor and table acts as one sum at the motor. These are the true, the guessed and the
+# fitted sum, and the inertia:
 
 # %%
 theta = dict(zip(result.estimate.names, result.estimate.theta, strict=True))

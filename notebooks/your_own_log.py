@@ -75,7 +75,6 @@ print(jaxid.check(case, trace))
 
 # %%
 declared = jaxid.identify(case, trace, method="inverse_dynamics")
-print("\n".join(declared.findings))
 declared
 
 # %% [markdown]

@@ -114,7 +114,8 @@ plt.show()
 # %% [markdown]
 # ## Many machines at once
 #
-# A function of a plant is a function of its leaves; `vmap` runs it for many.
+# A function of a plant is a function of its leaves; `vmap` runs it for many. Here all three values
+# change by up to 20 %. Black is the machine above.
 
 # %%
 leaves = lambda p: (p.inertia, p.weight, p.effects[0].coefficient)
@@ -122,7 +123,12 @@ theta = jnp.array([0.12, 2.4, 0.05])
 angle_of = lambda theta, adjoint=BACKWARD: motion(eqx.tree_at(leaves, plant, tuple(theta)), adjoint)
 many = theta * jnp.linspace(0.8, 1.2, 32)[:, None]
 fan = jax.jit(jax.vmap(angle_of))(many)
-print(fan.shape)
+plt.figure(figsize=(8, 3), layout="constrained")
+plt.plot(times, fan.T, color="C0", lw=0.6)
+plt.plot(times, angle, color="k")
+plt.xlabel("time [s]")
+plt.ylabel("angle [rad]")
+plt.show()
 
 # %% [markdown]
 # ## Hessian
@@ -145,15 +151,14 @@ columns = [
     for k in range(3)
 ]
 hessian_apart = float(jnp.abs(jnp.stack(columns) - hessian).max() / jnp.abs(hessian).max())
-print(hessian)
+print(np.array2string(np.asarray(hessian), precision=3))
 print(f"finite differences of the gradient: {hessian_apart:.0e} apart")
 
 # %% [markdown]
 # ## A fit
 #
 # `jaxid.fit` is a pure function of arrays. The log is SciPy's motion with noise of 5 mrad; guesses are
-# 10 % off.
-# This pendulum turns over, so that guesses much farther off may end in another minimum.
+# 10 % off. This pendulum turns over, so that guesses much farther off may end in another minimum.
 
 # %%
 command = np.asarray(torque(times)[0])[:, None]
@@ -166,4 +171,4 @@ fitted = jax.jit(
 )(jnp.asarray(noisy))
 sigmas = np.asarray((fitted.theta - theta) / fitted.std)
 for name, value, std, true in zip(free, fitted.theta, fitted.std, theta, strict=True):
-    print(f"{name:30s} {value:.5f} ± {std:.5f}, true {true}")
+    print(f"{name:30s} {value:.6f} ± {std:.6f}, true {true}")

@@ -39,6 +39,8 @@ GENERATED: dict[str, Callable[[Path], str]] = {
 LINK = re.compile(r"(?<!!)\[([^\]\[]*(?:\[[^\]]*\][^\]\[]*)*)\]\(([^)\s]+)\)")
 IMAGE = re.compile(r"!\[[^\]]*\]\(([^)\s]+)\)")
 FENCED = re.compile(r"^ *```.*?^ *```[^\n]*$", re.M | re.S)
+# A number with its percent sign, or a range of them, in a table: neither is broken over two lines.
+PERCENT = re.compile(r"(?<=\| )([\d.]+)(?:-([\d.]+))? %(?= \|)")
 HEADING = re.compile(r"^#{1,6} +(.+?) *(?:\{ *#([\w-]+) *\})? *$", re.M)
 
 
@@ -77,7 +79,7 @@ def stage(folder: Path) -> None:
         made[name] = moved(path.read_text("utf-8"), path, name, places, folder)
     for name, text in made.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text, "utf-8")
+        (folder / name).write_text(unbroken(text), "utf-8")
     shutil.copy(Path(__file__).with_name("style.css"), folder / "style.css")
     check_links(folder)
 
@@ -124,6 +126,11 @@ def moved(text: str, path: Path, name: str, places: dict[Path, str], folder: Pat
         out += [outside_of_blocks(text[end : block.start()]), block[0]]
         end = block.end()
     return "".join([*out, outside_of_blocks(text[end:])])
+
+
+def unbroken(text: str) -> str:
+    """Return a page whose tables do not break a percentage, or a range of them, over two lines."""
+    return PERCENT.sub(lambda m: "\u2011".join(filter(None, m.groups())) + "\u00a0%", text)
 
 
 def copied(file: Path, folder: Path) -> str:

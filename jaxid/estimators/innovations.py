@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import Transform
@@ -85,6 +85,11 @@ def whole_hessian(problem: Innovations, theta: Array, noise: Array) -> Float[Arr
     return observed_information(outputs, problem.counts, jnp.concatenate([theta, noise]))
 
 
+def noise_between_bounds(problem: Innovations, noise: Float[np.ndarray, " q"]) -> Bool[np.ndarray, " q"]:
+    """Return the mask of the noises that do not rest at a bound; one that does counts as known."""
+    return (noise > problem.low + _AT_BOUND) & (noise < problem.high - _AT_BOUND)
+
+
 def hessian_steps(problem: Innovations, scored: Scored) -> Steps[Float[np.ndarray, "p p"] | None]:
     """Compute the Hessian by the unknowns at a fit, of the likelihood maximised over the noise.
 
@@ -98,8 +103,7 @@ def hessian_steps(problem: Innovations, scored: Scored) -> Steps[Float[np.ndarra
     """
     p, x = problem.bounds[0].size, np.asarray(scored.x)
     whole = yield SolveRequest(whole_hessian, (problem, np.asarray(problem.transform.outward(x[:p])), x[p:]))
-    between = (x[p:] > problem.low + _AT_BOUND) & (x[p:] < problem.high - _AT_BOUND)
-    free = np.concatenate([np.ones(p, bool), between])
+    free = np.concatenate([np.ones(p, bool), noise_between_bounds(problem, x[p:])])
     return profiled_out(np.asarray(whole)[np.ix_(free, free)], np.arange(free.sum()) < p)
 
 

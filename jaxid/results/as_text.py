@@ -189,7 +189,8 @@ def discovery_table(result: Discovery) -> str:
     """Return the text that `discover` prints."""
     content = results.discovery_json(result)
     lines = [f"verdict: {result.verdict}", *[f"finding: {finding}" for finding in result.findings]]
-    if content["where"]:
+    # An effect says itself where it acts, better than a curve that knows no physics.
+    if content["where"] and not result.effects:
         lines.append(f"where:   {content['where']['text']}")
     for effect in result.effects:
         others = ", ".join(s.candidate.label for s in effect.alternatives)

@@ -56,6 +56,8 @@ def _drive_lines(session: Session) -> list[str]:
     gain = np.unique(np.round(machine.gain, 12))
     many = machine.gain.size
     lines = [f"{many} drives"] if many > 1 else []
+    if machine.unforced(session.fit.log):
+        return lines or ["force not logged"]
     if np.all(gain == 1.0):
         return lines or ["force as logged"]
     unit = machine.unit("force", machine.plant.driven(machine.plant.joints)[0])

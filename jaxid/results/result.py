@@ -162,6 +162,31 @@ class FitResult:
 
         return dataset_of(self, log)
 
+    def to_arviz(
+        self, draws: int = 1000, *, chains: int = 4, seed: int = 0, exact: bool = False
+    ) -> xarray.DataTree:
+        """Return draws from the posterior of the identifiable parameters, in the container of ArviZ 1.
+
+        The tree has the groups `posterior`, with a variable of chain and draw for each parameter, and
+        `observed_data`. Its functions take it as it is: `arviz.summary(result.to_arviz())`. ArviZ itself is
+        not needed to make it.
+
+        Args:
+            draws: Number of draws of each chain.
+            chains: Number of chains.
+            seed: Seed of the random numbers.
+            exact: Whether draws are from the likelihood of a fit by `prediction_error`, by a Markov chain,
+                with `lp` in `sample_stats`; otherwise they are from the normal distribution with the
+                estimates and their covariance, which does not know the bounds.
+
+        Raises:
+            InputError: If nothing is identifiable, or exact draws are asked of another method, of several
+                logs, or of a fit that has an unknown that is not identifiable.
+        """
+        from jaxid.results.as_arviz import posterior_of
+
+        return posterior_of(self, draws, chains, seed, exact)
+
     def case(self) -> Case:
         """Return the case with the results: estimates as guesses, and the effects that a search added.
 

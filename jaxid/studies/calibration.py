@@ -130,9 +130,9 @@ def verdict_words(what: str, row: dict) -> str:
     """
     if not row["intervals"]:
         return ""
-    held = f"{100 * row['coverage_95']:.1f} % of 95 %"
+    held = f"{100 * row['coverage_95']:.1f} % of 95 % intervals contain the truth"
     low, high = (100 * x for x in row["accepted_95"])
-    accepted = f"the 99 % binomial interval of {row['intervals']} intervals, {low:.1f} to {high:.1f} %"
+    accepted = f"the range of {row['intervals']} sound ones, {low:.1f} to {high:.1f} % (99 % binomial)"
     if row["verdict"] is None:
         return f"{what}: {held}; {row['intervals']} intervals are too few for a verdict"
     if row["verdict"] == "too narrow":

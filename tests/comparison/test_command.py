@@ -110,6 +110,7 @@ def test_the_files_hold_the_result(tmp_path, differing):
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "hysteresis in other" in page
     assert page.count("<img") == 3  # values by log, and the residual of each log
+    assert page.count('class="numbers"') == page.count('class="zoom') == 2
 
 
 def test_a_wrong_result_does_not_pass_the_schema(differing):

@@ -116,6 +116,11 @@ def test_a_link_that_leads_nowhere_stops_the_build(tmp_path, page, words):
     check_links(tmp_path)
 
 
+def test_percentages_in_tables_are_not_broken_over_lines():
+    assert staging.unbroken("| 86.7-100.0 % | 95 % |") == "| 86.7\u2011100.0\u00a0% | 95\u00a0% |"
+    assert staging.unbroken("of 60, 95 % hold; `1-2 %`") == "of 60, 95 % hold; `1-2 %`"
+
+
 def test_a_link_to_a_file_that_does_not_exist_stops_the_build(tmp_path):
     source = staging.ROOT / "docs" / "page.md"
     with pytest.raises(BrokenLinkError, match="no page and no file"):

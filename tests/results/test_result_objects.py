@@ -9,6 +9,7 @@ import xarray
 from matplotlib.figure import Figure
 
 import jaxid
+from jaxid.errors import InputError
 from tests.support.cli_setup import COULOMB, TRUTH, VISCOUS, place, recorded, text
 
 
@@ -257,3 +258,40 @@ def test_tables_of_a_study(studied):
     assert len(studied.to_pandas()) == len(studied.summary) == 8
     assert repr(studied).splitlines()[0].startswith("Study of axis: 40 runs under 2 setting(s)")
     assert studied._repr_html_().count("<tr>") == 9
+
+
+def draws_of(tree) -> np.ndarray:
+    """Draws of all parameters, (draws, p)."""
+    posterior = tree["posterior"].to_dataset()
+    return np.stack([np.ravel(posterior[name]) for name in posterior.data_vars], axis=1)
+
+
+def test_the_draws_have_the_names_and_the_covariance_of_the_result(fitted):
+    tree = fitted.to_arviz(5000, chains=2, seed=1)
+    assert isinstance(tree, xarray.DataTree)
+    posterior = tree["posterior"]
+    assert list(posterior.data_vars) == fitted.estimate.names
+    assert dict(posterior.sizes) == {"chain": 2, "draw": 5000}
+    assert posterior["inertia"].attrs["units"] == "kg"
+    assert posterior.attrs["source"].startswith("normal distribution")
+    draws, std = draws_of(tree), fitted.estimate.std
+    np.testing.assert_allclose((draws.mean(0) - fitted.estimate.theta) / std, 0.0, atol=0.05)
+    scaled = np.cov(draws.T) / np.outer(std, std)
+    np.testing.assert_allclose(scaled, fitted.covariance.correlation, atol=0.05)
+    assert tree["observed_data"]["position"].sizes["time"] == fitted.session.fit.log.samples
+    same = fitted.to_arviz(5000, chains=2, seed=1)
+    assert posterior.to_dataset().equals(same["posterior"].to_dataset())
+
+
+def test_exact_draws_need_a_likelihood_and_draws_a_number(fitted):
+    with pytest.raises(InputError, match="not made of inverse_dynamics"):
+        fitted.to_arviz(exact=True)
+    with pytest.raises(InputError, match="chains = 0"):
+        fitted.to_arviz(chains=0)
+
+
+def test_arviz_takes_the_tree(fitted):
+    arviz = pytest.importorskip("arviz_stats")
+    table = arviz.summary(fitted.to_arviz(500), round_to="none")
+    assert list(table.index) == fitted.estimate.names
+    assert float(table.loc["inertia", "mean"]) == pytest.approx(fitted.value("inertia"), rel=1e-2)

@@ -52,8 +52,8 @@ def test_verdicts(scale, bias, verdict):
         "too wide": "intervals of mass are wider than needed: ",
     }[verdict]
     assert words.startswith(opening)
-    assert "% of 95 %" in words
-    assert "the 99 % binomial interval of 400 intervals" in words
+    assert "% of 95 % intervals contain the truth, " in words
+    assert "the range of 400 sound ones, " in words
 
 
 def test_coverage_is_that_of_the_deviations():

@@ -44,8 +44,9 @@ def span(ax: Axes, view: LogView) -> None:
 
 
 def legend(ax: Axes) -> None:
-    """Put the legend above the plot."""
-    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
+    """Put the legend above the plot, at the right where a title stands at the left."""
+    loc, x = ("lower right", 1.0) if ax.get_title("left") else ("lower left", 0.0)
+    place = {"loc": loc, "bbox_to_anchor": (x, 1.0), "borderaxespad": 0.1}
     style = {"frameon": False, "fontsize": FONT, "handlelength": 1.6, "columnspacing": 1.2}
     ax.legend(ncols=3, **place, **style)
 

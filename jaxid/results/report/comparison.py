@@ -12,7 +12,7 @@ from jaxid.results.comparison import answer, comparison_notes, gap_rows, rival_w
 from jaxid.results.report.axes import TEXT, bucket_count, dress, legend, time_axes
 from jaxid.results.report.curves import envelope
 from jaxid.results.report.numbers import nats, plain, pretty_unit, scaled_unit, with_std
-from jaxid.results.report.page import filled, image
+from jaxid.results.report.page import filled, image, with_narrow
 from jaxid.results.report.plots import AFTER, BEFORE
 
 _WIDE, _NARROW = (11.5, 3.0), (4.6, 4.6)  # inch; time_axes makes one plot lower
@@ -35,9 +35,7 @@ def comparison_report(result: Comparison) -> str:
             draw = lambda size, gap=gap, joint=joint: plot_gap(
                 gap, int(joint), units[joint], size, named=bool(result.differences)
             )
-            picture = image(draw(_WIDE), words)
-            picture["narrow"] = image(draw(_NARROW), words)["source"]
-            residuals.append((name, picture))
+            residuals.append((name, with_narrow(image(draw(_WIDE), words), draw(_NARROW))))
 
     names = ", ".join(result.logs)
     return filled(

@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs neither network nor scripts."""
+"""The report as one HTML file that needs no network, and of which only the zooming needs its script."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from markupsafe import Markup
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from jaxid.results.report import first_page, plots
+from jaxid.results.report import first_page, plots, zoom
 from jaxid.results.report import words as tables
 from jaxid.results.report.data import ExperimentView, HistoryView, LogView, ReportData
 from jaxid.results.report.figure_tables import tables_of
@@ -96,8 +96,10 @@ def filled(template: str, **entries: object) -> str:
         lstrip_blocks=True,
         loader=FunctionLoader(lambda name: (folder / name).read_text(encoding="utf-8")),
     )
-    style = (folder / "page.css").read_text(encoding="utf-8")
-    return environment.get_template(template).render(style=Markup(style), **entries)
+    style = (folder / "page.css").read_text(encoding="utf-8") + zoom.script_style()
+    code = zoom.script()
+    common = {"style": Markup(style), "script": Markup(code), "digest": zoom.digest(code)}
+    return environment.get_template(template).render(**common, **entries)
 
 
 def _telling(data: ReportData, main: int | None) -> dict | None:
@@ -150,7 +152,7 @@ def _friction(data: ReportData) -> dict | None:
     drawn = image(plot_frictions(data.friction, data.units), words)
     if len(data.friction) > 1:
         drawn = with_narrow(drawn, plot_frictions(data.friction, data.units, columns=1))
-    sampled = any(view.force_measured is not None for view in data.friction)
+    sampled = any(view.force_measured is not None and len(view.force_measured) for view in data.friction)
     return {"title": words, "wide": len(data.friction) > 1, "sampled": sampled} | drawn
 
 
@@ -282,6 +284,7 @@ def image(figure: Figure, words: str) -> dict:
         "height": height,
         "narrow": None,
         "tables": tables_of(figure),
+        "charts": zoom.charts_of(figure),
     }
 
 

@@ -94,15 +94,20 @@ def answer(data: ReportData) -> str:
     # The finding on a model that a search left as it was says the same.
     lines = [opening, first] if opening and (data.verdict == "found" or not data.findings) else [first]
 
-    # One line for each quantity, of two joints at most one each: the table below has the other logs.
+    # One line for each quantity and unit, of two joints at most one each: the table below has the other logs.
     rows = [r for r in gap_rows(data) if is_number(r.after)]
     rows = [r for r in rows if not (data.drifted and r.quantity.startswith(SIMULATED))]
-    groups: dict[str, list[GapRow]] = {}
+    quantities: dict[str, list[GapRow]] = {}
     for row in (r for r in rows if r.log == rows[0].log):
-        groups.setdefault(row.quantity.split(", joint ")[0], []).append(row)
-    for quantity, of_joints in groups.items():
-        several = len(of_joints) > 2
-        lines += [_gaps_words(quantity, of_joints)] if several else [_gap_words(row) for row in of_joints]
+        quantities.setdefault(row.quantity.split(", joint ")[0], []).append(row)
+    for quantity, of_joints in quantities.items():
+        if len(of_joints) <= 2:
+            lines += [_gap_words(row) for row in of_joints]
+            continue
+        for unit in dict.fromkeys(row.unit for row in of_joints):
+            alike = [row for row in of_joints if row.unit == unit]
+            every = len(alike) == len(of_joints)
+            lines.append(_gaps_words(quantity, alike, every) if len(alike) > 1 else _gap_words(alike[0]))
 
     return unbroken(" ".join(line if line[-1] in ".!?:;" else f"{line}." for line in lines))
 
@@ -307,8 +312,8 @@ def _change(before: str, after: str, old: float | None, new: float | None) -> st
     return f"{'rises' if rises else 'falls'} from {before} to {after}"
 
 
-def _gaps_words(quantity: str, rows: Sequence[GapRow]) -> str:
-    """Return the gaps of many joints at once, as ranges."""
+def _gaps_words(quantity: str, rows: Sequence[GapRow], every: bool = True) -> str:
+    """Return the gaps of several joints of one unit as ranges; unless it is every joint, they are named."""
     numbers = [x for r in rows for x in (r.before, r.after, r.floor) if is_number(x)]
     scale, unit = scaled_unit(rows[0].unit, numbers)
 
@@ -325,7 +330,9 @@ def _gaps_words(quantity: str, rows: Sequence[GapRow]) -> str:
     fall = _change(before, after, *sizes) if before else f"is {after}"
     over = f", at noise floors of {floor}" if floor else ""
     log = _log_words(rows[0].log)
-    return f"The {quantity} residual of the {len(rows)} joints on the {log} {fall} (RMS){over}"
+    names = [row.quantity.rpartition("joint ")[2] for row in rows]
+    joints = f"the {len(rows)} joints" if every else f"joints {', '.join(names[:-1])} and {names[-1]}"
+    return f"The {quantity} residual of {joints} on the {log} {fall} (RMS){over}"
 
 
 def gap_rows(data: ReportData) -> list[GapRow]:
