@@ -24,6 +24,8 @@ from benchmarks.stored_runs import append_runs, commit_of, read_runs
 
 HERE = Path(__file__).parent / "results"
 CHUNK = 10
+# Guesses are half as large again as the truth, or smaller by as much.
+WITHIN_PRIOR = "[within_prior]\nprior = 0.5\n"
 CELLS = [f"{machine}/{loop}/{sensor}" for machine in MACHINES for loop in LOOPS for sensor in SENSORS]
 
 
@@ -34,6 +36,7 @@ def run_chunk(cell: str, method: str | None, seeds: list[int], commit: str) -> l
     with tempfile.TemporaryDirectory() as folder:
         for seed in seeds:
             text, log, true = MACHINES[machine](seed, loop, sensor)
+            text += WITHIN_PRIOR if method == "within_prior" else ""
             path = Path(folder) / f"{seed}.toml"
             path.write_text(text)
             cases.append(path)

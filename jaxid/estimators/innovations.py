@@ -73,7 +73,9 @@ def fit(problem: Innovations, theta: Array, noise: Array, max_steps: Array) -> S
 
 def fit_steps(problem: Innovations, theta: Array, noise: Array, max_steps: int) -> Steps[Scored]:
     """Run `fit` as a solve request; the result holds arrays of numpy, with which nothing more is compiled."""
-    scored = yield SolveRequest(fit, (problem, theta, noise, np.asarray(max_steps)))
+    # Joints that push each other share the steps in which one of them turns, which take many times as long.
+    request = SolveRequest(fit, (problem, theta, noise, np.asarray(max_steps)), alone=problem.plant.coupled)
+    scored = yield request
     return jax.tree.map(np.asarray, scored)
 
 

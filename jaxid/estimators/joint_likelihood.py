@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.estimators.common.scoring import Scored
-from jaxid.estimators.innovations import Innovations, fit_steps
+from jaxid.estimators.innovations import Innovations, fit, fit_steps
 from jaxid.estimators.likelihood import Likelihood
 from jaxid.estimators.several.descent import Descent, Model, descent_steps
 from jaxid.estimators.several.parts import Part
 from jaxid.machine import Machine
-from jaxid.numerics.lanes import Steps
+from jaxid.numerics.lanes import ParallelCalls, Steps
 from jaxid.numerics.precision import Rows
 
 # Rise of the log-likelihood [nats] below which a fit of several logs has converged, as of one log.
@@ -209,6 +209,25 @@ class JointLikelihood:
 def scored_at(problem: Innovations, x: np.ndarray, p: int) -> Steps[Scored]:
     """Evaluate the likelihood of one log at p unknowns and the noises on the scale of the solver."""
     return (yield from fit_steps(problem, np.asarray(problem.transform.outward(x[:p])), x[p:], 1))
+
+
+def gradients_together(problems: Sequence[Innovations], x: np.ndarray, p: int) -> Steps[list[np.ndarray]]:
+    """Return the gradients of several likelihoods at one point, see `scored_at`.
+
+    Those of joints that push each other are computed in threads, one per core.
+    """
+    if problems and problems[0].plant.coupled:
+        theta = np.asarray(problems[0].transform.outward(x[:p]))
+        return (yield ParallelCalls(_gradient, [(problem, theta, x[p:]) for problem in problems]))
+    gradients = []
+    for problem in problems:
+        gradients.append((yield from scored_at(problem, x, p)).gradient)
+    return gradients
+
+
+def _gradient(problem: Innovations, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    # The slopes of each sample are dropped at once: those of many logs fill the memory.
+    return np.asarray(fit(problem, theta, noise, np.asarray(1)).gradient)
 
 
 def _information(scored: Scored) -> np.ndarray:

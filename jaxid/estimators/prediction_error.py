@@ -19,7 +19,13 @@ from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.common.shapes import shape_starts
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.innovations import STEPS, hessian_steps, profile_steps
-from jaxid.estimators.joint_likelihood import JointLikelihood, Maximum, Member, scored_at
+from jaxid.estimators.joint_likelihood import (
+    JointLikelihood,
+    Maximum,
+    Member,
+    gradients_together,
+    scored_at,
+)
 from jaxid.estimators.likelihood import likelihood_of, needed_numerics
 from jaxid.estimators.several.parts import Part, by_log
 from jaxid.estimators.several.sums import stacked
@@ -300,15 +306,15 @@ def _corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[tuple[np.ndarr
         information[np.ix_(place, place)] += (yield from scored_at(member.problem, own, p)).information
         if not np.any(read > 0):
             continue
-        kalman, gradients = member.problem.kalman, []
+        kalman, noisier = member.problem.kalman, []
         command, every = np.asarray(kalman.command), kalman.every
         for _ in range(_PAIRS):
             more = read * rng.standard_normal((len(command[::every]), drives))
             more = np.repeat(more, every, axis=0)[: len(command)]
             for sign in (1.0, -1.0):
                 shifted = eqx.tree_at(lambda k: k.command, kalman, command + sign * more)
-                at = yield from scored_at(member.problem._replace(kalman=shifted), own, p)
-                gradients.append(at.gradient)
+                noisier.append(member.problem._replace(kalman=shifted))
+        gradients = yield from gradients_together(noisier, own, p)
         gradient[place] += np.mean(gradients, axis=0)
 
     if not any(np.any(read > 0) for read in reads):

@@ -27,10 +27,12 @@ class SolveRequest(NamedTuple):
     Args:
         function: Compiled function that takes and returns trees of arrays; other leaves are static.
         args: Arguments of the function for one run.
+        alone: Whether it is not stacked with others, since each would take the long branches of all.
     """
 
     function: Callable
     args: tuple
+    alone: bool = False
 
 
 class Precompile(NamedTuple):
@@ -158,7 +160,7 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     """
     ended: dict[int, T | Exception] = {}
     # Requests that wait to be solved: the runs and their arrays by key, in the order of the requests.
-    groups: dict[Any, list[tuple[int, list[np.ndarray]]]] = {}
+    groups: dict[_Key, list[tuple[int, list[np.ndarray]]]] = {}
 
     def advance(k: int, answer: Any) -> None:
         try:
@@ -178,7 +180,8 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     while groups:
         # The largest group is solved first; the smaller ones may grow meanwhile.
         key = max(groups, key=lambda key: len(groups[key]))
-        some, groups[key] = groups[key][:lanes], groups[key][lanes:]
+        most = len(groups[key]) if key.alone else lanes
+        some, groups[key] = groups[key][:most], groups[key][most:]
         if not groups[key]:
             del groups[key]
         for (k, _), answer in zip(some, _solved(key, [arrays for _, arrays in some], lanes), strict=True):
@@ -205,13 +208,23 @@ def solved_together(requests: Sequence[SolveRequest]) -> Steps[list[Any]]:
     return answers
 
 
-def _parted(asked: SolveRequest) -> tuple[Any, list[np.ndarray]]:
-    """Return the key that is common to runs solved together, and the arrays of this run."""
+class _Key(NamedTuple):
+    """What is common to requests that are solved together: all but the values of their arrays."""
+
+    function: Callable
+    structure: Any
+    static: tuple
+    shapes: tuple
+    alone: bool
+
+
+def _parted(asked: SolveRequest) -> tuple[_Key, list[np.ndarray]]:
+    """Return the key of a request, and its arrays."""
     leaves, structure = jax.tree.flatten(asked.args)
     arrays = [np.asarray(x) for x in leaves if isinstance(x, _ARRAYS)]
     static = tuple(_Hole if isinstance(x, _ARRAYS) else x for x in leaves)
     shapes = tuple((x.shape, x.dtype) for x in arrays)
-    return (asked.function, structure, static, shapes), arrays
+    return _Key(asked.function, structure, static, shapes, asked.alone), arrays
 
 
 class _Hole:
@@ -221,12 +234,13 @@ class _Hole:
 _ARRAYS = (np.ndarray, np.generic, jax.Array)
 
 
-def _solved(key: Any, runs: list[list[np.ndarray]], lanes: int) -> list[Any]:
+def _solved(key: _Key, runs: list[list[np.ndarray]], lanes: int) -> list[Any]:
+    if key.alone:
+        return in_threads(key.function, [_joined(key.structure, key.static, own) for own in runs])
     filled = [*runs, *[runs[-1]] * (lanes - len(runs))]
     # Numpy stacks them, which needs one transfer each; JAX would dispatch one operation per run.
     stacked = [np.stack(x) for x in zip(*filled, strict=True)]
-    function, structure, static, _ = key
-    found = jax.tree.map(np.asarray, _batched(function, structure, static, stacked))
+    found = jax.tree.map(np.asarray, _batched(key.function, key.structure, key.static, stacked))
     leaves, structure = jax.tree.flatten(found)
     return [jax.tree.unflatten(structure, [x[k] for x in leaves]) for k in range(len(runs))]
 

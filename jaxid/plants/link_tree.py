@@ -14,6 +14,7 @@ from jaxid.arrays import Array
 from jaxid.model.effect import Effect
 from jaxid.model.links import WithLinks
 from jaxid.model.parameter import as_array, parameter
+from jaxid.plants.few_joints import MOST_JOINTS, FewJoints
 from jaxid.plants.geometry import Geometry
 from jaxid.plants.rigid_tree import Tree, inverse_dynamics, pseudo_inertia
 
@@ -48,6 +49,7 @@ class LinkTree(WithLinks):
         gear_ratio: Turns of each motor for one of its joint, (n,): rotors count times its square. None: 1.
         actuated: Driven joints, 0-based, in the order of their drives; None: all.
         moments: Pseudo-inertias of the links, (links, 4, 4), as `prepared` computes them from the parameters.
+        polynomials: Forces of a chain of few joints, as `prepared` computes them from the parameters.
 
     Source:
         `jaxid.plants.rigid_tree`; Khalil & Kleinfinger (1987) for parameters about the origins of modified
@@ -85,6 +87,7 @@ class LinkTree(WithLinks):
     )
     actuated: tuple[int, ...] | None = eqx.field(static=True, default=None, kw_only=True)
     moments: Array | None = eqx.field(default=None, kw_only=True)
+    polynomials: FewJoints | None = eqx.field(default=None, kw_only=True)
 
     @property
     def joints(self) -> int:
@@ -149,11 +152,7 @@ class LinkTree(WithLinks):
 
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Return the forces of the links, whose derivatives are analytical, and of the rotors."""
-        moments = self._moments() if self.moments is None else self.moments
-        motion = (self._of_links(x) for x in (q, qd, qdd))
-        tau = inverse_dynamics(self.tree, self.geometry, -self.gravity_vector, moments, *motion)
-        if self.copies:
-            tau = jnp.sum(self._ratios().T * tau[None, :], axis=1)
+        tau = self._links_force(q, qd, qdd) if self.polynomials is None else self.polynomials(q, qd, qdd)
         if self.rotor_inertia is None:
             return tau
         if self.gear_ratio is None:
@@ -161,7 +160,22 @@ class LinkTree(WithLinks):
         return tau + self.rotor_inertia * self.gear_ratio**2 * qdd
 
     def prepared(self) -> Self:
-        return replace(self, geometry=self.geometry.at_zero(), moments=self._moments())
+        geometry, moments, polynomials = self.geometry.at_zero(), self._moments(), None
+        if self._is_chain and self.joints <= MOST_JOINTS:
+            polynomials = FewJoints.of(self.tree, geometry, -self.gravity_vector, moments)
+        return replace(self, geometry=geometry, moments=moments, polynomials=polynomials)
+
+    @property
+    def _is_chain(self) -> bool:
+        """True if each link hangs on the one before, by a joint of its own."""
+        return not self.copies and self.tree.parents == tuple(range(-1, self.joints - 1))
+
+    def _links_force(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """Return the forces of the links by their recursion."""
+        moments = self._moments() if self.moments is None else self.moments
+        motion = (self._of_links(x) for x in (q, qd, qdd))
+        tau = inverse_dynamics(self.tree, self.geometry, -self.gravity_vector, moments, *motion)
+        return jnp.sum(self._ratios().T * tau[None, :], axis=1) if self.copies else tau
 
     def _ratios(self) -> Float[np.ndarray, "links n"]:
         """Return how much each link's joint moves with each free joint."""

@@ -77,6 +77,20 @@ def test_parts_run_beside_each_other_after_the_first_of_their_kind():
     assert isinstance(run_batched([estimator([-1.0])], 2)[0], ValueError)
 
 
+def test_a_request_that_is_alone_is_not_stacked():
+    shapes = []
+
+    def function(x):
+        shapes.append(x.shape)
+        return 2.0 * x
+
+    def estimator(x):
+        return float((yield SolveRequest(function, (np.asarray(x),), alone=True)))
+
+    assert run_batched([estimator(x) for x in (1.0, 2.0, 3.0)], 16) == [2.0, 4.0, 6.0]
+    assert shapes == [()] * 3
+
+
 def test_many_together_do_without(seen):
     function, threads, _ = seen
     many = [estimator(x, [Precompile(function, (x,), (function, x))]) for x in (1.0, 2.0, 3.0)]
