@@ -28,7 +28,7 @@ from jaxid.model.unknowns import Free, Parameters, scatter, seeds
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import in_threads
 from jaxid.own_values import OwnValues
-from jaxid.simulation.force_balance import ForceData, force_and_columns, force_residual
+from jaxid.simulation.force_balance import ForceData, force_and_columns, force_residual, scale_columns
 
 # A candidate with more starts than this is evaluated on a plant without other effects, all starts at once.
 _FEW = 8
@@ -88,12 +88,20 @@ class Point:
         start: Index of the start.
         offset: Residual at the start minus the residual of the current model, (kept, n).
         columns: Derivatives of the residual in the candidate's unknowns, (kept, n, parameters).
+        unscaled: The same without the change of the drives' ratio, by which the whole residual is divided;
+            None: the candidate does not change the ratio.
     """
 
     candidate: Candidate
     start: int
     offset: Float[np.ndarray, "kept n"]
     columns: Float[np.ndarray, "kept n k"]
+    unscaled: Float[np.ndarray, "kept n k"] | None = None
+
+    @property
+    def explaining(self) -> Float[np.ndarray, "kept n k"]:
+        """Columns that may explain a residual: a mere scale of it explains nothing."""
+        return self.columns if self.unscaled is None else self.unscaled
 
     @property
     def strength(self) -> Float[np.ndarray, "kept n"] | None:
@@ -415,12 +423,33 @@ def points(
                 at[c.index] = c.probe(k)
             e, jacobian = evaluate(superset, data, at, np.concatenate([c.index for c in group]))
             for c in group:
-                shift = np.zeros_like(e)
+                shift, unscaled = np.zeros_like(e), None
                 if not group[0].amplitude.any():
                     joints = slice(None) if len(group) == 1 else slice(c.port, c.port + 1)
                     shift[:, joints] = (e - residual)[:, joints]
-                results.append(Point(c, k, shift, jacobian[..., c.index]))
+                if group is not faint:
+                    # At a neutral start, as of a gain, only the ratio keeps zeros from solving the balance.
+                    scale = _changes_of_scale(superset, data.arrays, at, c.index)
+                    unscaled = jacobian[..., c.index] + e[..., None] * scale
+                results.append(Point(c, k, shift, jacobian[..., c.index], unscaled))
     return results
+
+
+def _changes_of_scale(
+    superset: CandidateModel, logs: Sequence[Viewed], theta: Float[np.ndarray, " p"], index: np.ndarray
+) -> Float[np.ndarray, "kept n k"]:
+    """Compute the derivatives of the logarithm of the drives' ratio in some unknowns, for every sample."""
+    directions = np.eye(len(theta))[:, index]
+    parts = []
+    for log in logs:
+        own = superset if log.view is None else log.view.superset(superset)
+        at = theta if log.view is None else log.view.theta(theta)
+        machine = own.machine
+        slopes = scale_columns(
+            machine.plant, machine.parameters.places, log.data, jnp.asarray(at), directions
+        )
+        parts.append(np.broadcast_to(np.asarray(slopes), (len(log.data.weight), *slopes.shape)))
+    return np.concatenate(parts)
 
 
 def grid_points(superset: CandidateModel, candidate: Candidate, data: CandidateSamples) -> list[Point]:

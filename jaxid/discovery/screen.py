@@ -105,13 +105,13 @@ def has_influence(p: cand.Point, counts: np.ndarray, scale: np.ndarray) -> bool:
 
     Residuals are in units of the declared force, so that every effect on the drive also scales them a little.
     If it does nothing else, for instance a limit that no sample reaches, its column is the residual itself:
-    scaled to length one it would explain everything.
+    scaled to length one it would explain everything. So the change of scale does not count.
     """
     c = p.candidate
     if c.amplitude.any():
         return True
     start = c.starts[p.start]
-    change = stacked(p.columns * np.where(start != 0, np.abs(start), 1.0), counts, scale)
+    change = stacked(p.explaining * np.where(start != 0, np.abs(start), 1.0), counts, scale)
     return float(np.sum(change**2)) > _HIDDEN * len(change)
 
 
@@ -236,25 +236,55 @@ def _guess(
 def all_columns(
     e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
-    """Return the columns of every candidate with few starts, and of one with many if it clearly explains."""
-    columns = np.concatenate([p.columns for p in points if not p.candidate.has_grid], axis=2)
+    """Return columns of every candidate that might explain a residual.
+
+    A candidate in the drive contributes those of its best start. Its columns hold the noise of the logged
+    force: lags and delays of several lengths together are a filter that reproduces the noise of the residual.
+    A candidate with many starts contributes only if its best start clearly explains.
+    """
+    in_drive = [p for p in points if not p.candidate.has_grid and not p.candidate.amplitude.any()]
+    others = [p for p in points if not p.candidate.has_grid and p.candidate.amplitude.any()]
+    none = np.zeros((*e.shape, 0))
+    columns = np.concatenate([none, *(p.explaining for p in others)], axis=2)
+
+    chosen = []
+    by_candidate: dict[int, list[cand.Point]] = {}
+    for p in in_drive:
+        by_candidate.setdefault(id(p.candidate), []).append(p)
+    for starts in by_candidate.values():
+        gained = _gains(e, base, columns, starts, counts, scale) if len(starts) > 1 else np.zeros(1)
+        chosen.append(starts[int(np.argmax(gained))].explaining)
+    columns = np.concatenate([columns, *chosen], axis=2)
+
     many = [p for p in points if p.candidate.has_grid]
     if not many:
         return columns
-
-    explained = span(*(stacked(x, counts, scale) for x in (base, columns)))
-    rest = left_over(explained, stacked(e[..., None], counts, scale)[:, 0])
-    gained = np.zeros(len(many))
-    for first in range(0, len(many), _TOGETHER):
-        unit_columns = [unit(stacked(p.columns, counts, scale)) for p in many[first : first + _TOGETHER]]
-        ends = np.cumsum([x.shape[1] for x in unit_columns])[:-1]
-        fresh = np.split(left_over(explained, np.concatenate(unit_columns, axis=1)), ends, axis=1)
-        for k, new in enumerate(fresh, start=first):
-            part = np.sum((np.linalg.qr(new)[0].T @ rest) ** 2) / max(np.sum(rest**2), 1e-300)
-            gained[k] = -0.5 * counts.sum() * np.log1p(-min(part, 1 - 1e-12))
-
+    gained = _gains(e, base, columns, many, counts, scale)
     best = int(np.argmax(gained))
     # The gain that the best of so many starts reaches by chance once in a thousand.
     chance = np.log(1000 * len(many)) + many[best].columns.shape[2]
     clear = [many[best].columns] if gained[best] > chance else []
     return np.concatenate([columns, *clear], axis=2)
+
+
+def _gains(
+    e: np.ndarray,
+    base: np.ndarray,
+    columns: np.ndarray,
+    points: list[cand.Point],
+    counts: np.ndarray,
+    scale: np.ndarray,
+) -> np.ndarray:
+    """Return the gain in log-likelihood by the columns of each point alone, beside other columns."""
+    explained = span(*(stacked(x, counts, scale) for x in (base, columns)))
+    rest = left_over(explained, stacked(e[..., None], counts, scale)[:, 0])
+    gained = np.zeros(len(points))
+    for first in range(0, len(points), _TOGETHER):
+        some = points[first : first + _TOGETHER]
+        unit_columns = [unit(stacked(p.explaining, counts, scale)) for p in some]
+        ends = np.cumsum([x.shape[1] for x in unit_columns])[:-1]
+        fresh = np.split(left_over(explained, np.concatenate(unit_columns, axis=1)), ends, axis=1)
+        for k, new in enumerate(fresh, start=first):
+            part = np.sum((np.linalg.qr(new)[0].T @ rest) ** 2) / max(np.sum(rest**2), 1e-300)
+            gained[k] = -0.5 * counts.sum() * np.log1p(-min(part, 1 - 1e-12))
+    return gained

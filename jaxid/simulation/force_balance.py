@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array, library
 from jaxid.dynamics.hidden_joints import complete_motion
-from jaxid.dynamics.residuals import residual_along
+from jaxid.dynamics.residuals import balance_along, drive_ratio, residual_along
 from jaxid.logs.prepare import Prepared
 from jaxid.model.drives import Drives
 from jaxid.model.plant import Plant
@@ -104,6 +104,31 @@ def force_and_columns(
     count = theta.size if directions is None else directions.shape[1]
     jacobian, e = jax.jacfwd(residual, has_aux=True)(jnp.zeros(count))
     return e, jacobian
+
+
+@kept_jit
+def scale_columns(
+    plant: Plant, places: tuple, data: ForceData, theta: Array, directions: Array
+) -> Float[Array, "n c"]:
+    """Return the derivatives of the logarithm of the drives' ratio, by which every residual is divided.
+
+    Args:
+        plant: The plant.
+        places: Places of the unknowns in the plant.
+        data: Arrays of the prepared log.
+        theta: Values of the unknowns, (p,).
+        directions: Directions of the derivatives, (p, c).
+    """
+
+    def logarithm(step: Array) -> Array:
+        moved = scatter(places, plant, theta + directions @ step)
+        delays = moved.command_delays(data.force.shape[1])
+        u = signals.delayed(data.force, delays, data.period, hold=data.hold)
+        motion = whole_motion(moved, data, u)
+        drive = balance_along(moved, *motion, u, data.period, data.start)[1]
+        return jnp.log(drive_ratio(moved, drive, u, data.q.shape[1]))
+
+    return jax.jacfwd(logarithm)(jnp.zeros(directions.shape[1]))
 
 
 def measured_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:

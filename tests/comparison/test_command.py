@@ -149,6 +149,22 @@ def test_what_differs_between_two_exact_axes_is_named(tmp_path, what):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "pair",
+    [
+        # The residual of one model for both is 60 times the noise: a drive effect's column is its scale.
+        Pair("payload", "heavy_slide", 0.3, 60_134),
+        # A short log: lags and delays of several lengths reproduce the noise of the force.
+        Pair("friction", "servo", 3.0, 60_110, sensor=False),
+    ],
+    ids=lambda pair: pair.id,
+)
+def test_drive_effects_do_not_whiten_a_difference_away(tmp_path, pair):
+    found = records(pair, tmp_path)
+    assert sorted(d.label for d in found.differences) == sorted(pair.names)
+
+
+@pytest.mark.slow
 def test_the_logs_of_the_demo_are_of_one_axis():
     folder = Path(jaxid.__file__).parent / "demo"
     found = jaxid.compare(folder / "case.toml", [folder / "log.csv", folder / "validation.csv"])

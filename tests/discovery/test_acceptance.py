@@ -236,11 +236,11 @@ def test_a_limit_that_no_sample_reaches_has_no_influence(tmp_path):
     saturation = next(c for c in search.superset.candidates if c.kind == "saturation")
     far = dataclasses.replace(saturation, starts=np.array([1.2 * saturation.starts[0]]))
     near = dataclasses.replace(saturation, starts=np.array([0.7 * saturation.starts[0]]))
-    felt = [
+    influence = [
         has_influence(*cand.points(search.superset, [c], search.samples, search.theta, e), counts, scale)
         for c in (far, near)
     ]
-    assert felt == [False, True]
+    assert influence == [False, True]
 
 
 def test_the_validation_log_may_ask_for_a_search(axis):

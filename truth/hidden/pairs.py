@@ -35,7 +35,7 @@ from truth.hidden.oracle import (
     moving,
 )
 
-FIRST_SEED = {"calibrate": 50_000, "test": 60_000}
+FIRST_SEED = {"calibrate": 50_000, "test": 60_000, "fresh": 70_000}
 ON_AXIS = ("friction", "torque_constant", "payload", "temperature")
 ON_BELT = ("loose_belt", "backlash")
 # What a comparison must name: the parameter, or the effect in one log.
