@@ -28,7 +28,16 @@ KINDS = ("cost", "Gauss-Newton step")
 
 
 def child(kind: str, patience: float, *words: object) -> dict:
-    """What a fresh process prints of itself, on a kind of device; else why it printed nothing."""
+    """Run one measurement in a fresh process on a device, and return the record that it prints.
+
+    Args:
+        kind: Platform of JAX: cpu, cuda.
+        patience: Time after which the process is ended [s].
+        words: Name of the measurement (sets, study, device) and its arguments.
+
+    Returns:
+        The record; `error` in its place if the process fails or takes too long.
+    """
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
     environment = os.environ | dict.fromkeys(names, "1") | {"JAX_PLATFORMS": kind}
     line = [sys.executable, "-m", "benchmarks.accelerator", "--child", *map(str, words)]
@@ -41,7 +50,17 @@ def child(kind: str, patience: float, *words: object) -> dict:
 
 
 def sets(kind: str, count: int, numerics: str) -> dict:
-    """Cost, or normal equations too, of so many sets of the axis' four parameters; 25 000 samples."""
+    """Time many parameter sets of the axis on a log of 25 000 samples, and return seconds and results.
+
+    Args:
+        kind: "cost", half the sum of squares; or "Gauss-Newton step", of which J'e is kept.
+        count: Number of sets of four parameters, drawn within 20 % of the true ones.
+        numerics: "smooth" or "ideal" friction.
+
+    Returns:
+        `s`, median of three warm calls [s]; `first_s`, the call that compiles [s]; `found`, results of the
+        first 1024 sets, each a cost [m^2] or J'e, four numbers.
+    """
     import jax
 
     from benchmarks import axis
@@ -50,10 +69,10 @@ def sets(kind: str, count: int, numerics: str) -> dict:
     reference, measured = axis.log()
     run = axis.replay(reference, Numerics(set_valued=numerics == "ideal"))
     spread = np.random.default_rng(0).uniform(0.8, 1.2, (count, 4))
-    thetas, seen = axis.TRUTH * spread, jax.numpy.asarray(measured)
+    thetas, measured = axis.TRUTH * spread, jax.numpy.asarray(measured)
 
-    def step(run: object, base: object, thetas: jax.Array, seen: jax.Array) -> jax.Array:
-        return jax.vmap(lambda theta: axis.gauss_newton(run, base, theta, seen)[1])(thetas)
+    def step(run: object, base: object, thetas: jax.Array, measured: jax.Array) -> jax.Array:
+        return jax.vmap(lambda theta: axis.gauss_newton(run, base, theta, measured)[1])(thetas)
 
     of_sets = {"cost": axis.costs, "Gauss-Newton step": step}[kind]
     function = axis.Compiled(of_sets, run, axis.plant(axis.TRUTH))
@@ -63,7 +82,7 @@ def sets(kind: str, count: int, numerics: str) -> dict:
 
     def whole() -> np.ndarray:
         with ThreadPoolExecutor(1 if alone else os.cpu_count()) as pool:
-            return np.concatenate(list(pool.map(lambda g: np.asarray(function(g, seen)), groups)))
+            return np.concatenate(list(pool.map(lambda g: np.asarray(function(g, measured)), groups)))
 
     begin = time.perf_counter()
     found = whole()
@@ -76,7 +95,12 @@ def sets(kind: str, count: int, numerics: str) -> dict:
 
 
 def study(name: str, runs: int) -> dict:
-    """A study whole, the second of its kind in the process; and the first, which compiles."""
+    """Time a whole study: the first in the process, which compiles, and the second, which is counted.
+
+    Returns:
+        `s` and `first_s` [s]; `ms` a run; the numbers of runs that failed and of runs that were fitted alone;
+        the estimates, (runs, unknowns); runs in a chunk.
+    """
     import jaxid
     from jaxid.studies.plan import Plan
     from jaxid.studies.runs import Runner
@@ -95,13 +119,19 @@ def study(name: str, runs: int) -> dict:
         result = jaxid.study(case, runs=runs, seed=seed)
         seconds.append(time.perf_counter() - begin)
     estimate = result.table["estimate"].values.reshape(runs, -1)
-    told = dict(found=np.nan_to_num(estimate).tolist(), chunk=Plan.of(case, runs=runs).chunk)
-    failed, ms = sum(f["runs"] for f in result.failures), 1e3 * seconds[1] / runs
-    return {"s": seconds[1], "first_s": seconds[0], "ms": ms, "failed": failed, "alone": len(alone)} | told
+    return {
+        "s": seconds[1],
+        "first_s": seconds[0],
+        "ms": 1e3 * seconds[1] / runs,
+        "failed": sum(f["runs"] for f in result.failures),
+        "alone": len(alone),
+        "found": np.nan_to_num(estimate).tolist(),
+        "chunk": Plan.of(case, runs=runs).chunk,
+    }
 
 
 def device() -> dict:
-    """What JAX sees, and the machine around it."""
+    """Describe the device that JAX sees, and the machine around it."""
     import jax
 
     around = {"cores": os.cpu_count(), "python": platform.python_version(), "jax": jax.__version__}
@@ -109,7 +139,15 @@ def device() -> dict:
 
 
 def row(what: str, count: int, kinds: tuple[str, str], patience: float, *words: object) -> dict:
-    """Both sides, and how far apart they are."""
+    """Measure the same on the processor and on the accelerator, and compare the results.
+
+    Args:
+        what: Name of the row.
+        count: Number of sets or runs.
+        kinds: Platforms of the two sides.
+        patience: Time that a process may take [s].
+        words: Arguments of `child`.
+    """
     sides = {side: child(kind, patience, *words) for side, kind in zip(("cpu", "cuda"), kinds, strict=True)}
     out = {"what": what, "count": count}
     found = [np.asarray(side.pop("found")) for side in sides.values() if "found" in side]
@@ -122,7 +160,7 @@ def row(what: str, count: int, kinds: tuple[str, str], patience: float, *words: 
 
 
 def asked(quick: bool) -> list[tuple]:
-    """All rows: what, how many, and the words for a process."""
+    """Return all rows: name, number of sets or runs, and arguments of a process."""
     rows = [
         (f"study of the {name}", count, "study", name, count)
         for name, counts in RUNS.items() for count in counts[: 1 if quick else None]
@@ -135,12 +173,12 @@ def asked(quick: bool) -> list[tuple]:
     return rows
 
 
-def table(rows: list[dict], seen: dict) -> str:
-    """In Markdown."""
+def table(rows: list[dict], machine: dict) -> str:
+    """Return the table in Markdown."""
     lines = [
         "# Batches on an accelerator", "",
         "Written by `python -m benchmarks.accelerator`; what is measured is in `benchmarks/README.md`.", "",
-        "{kind} against {cores} cores of the same machine, python {python}, jax {jax}.".format(**seen), "",
+        "{kind} against {cores} cores of the same machine, python {python}, jax {jax}.".format(**machine), "",
         "| of | sets or runs | cores s | accelerator s | ratio | first, cores s | accelerator s | differ |",
         "|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
@@ -156,7 +194,7 @@ def table(rows: list[dict], seen: dict) -> str:
 
 
 def write(found: dict, folder: Path) -> None:
-    """What was measured, and its table."""
+    """Write the measurements as JSON, and their table, to a folder."""
     (folder / "accelerator.json").write_text(json.dumps(found, indent=1) + "\n")
     (folder / "accelerator.md").write_text(table(found["rows"], found["seen"]))
 

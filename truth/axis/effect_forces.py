@@ -28,7 +28,7 @@ class Instant(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """What tests need to know of one effect.
+    """Facts about one effect that tests need.
 
     Attributes:
         kind: Its registered name.

@@ -74,7 +74,7 @@ KINDS = {
 
 @dataclasses.dataclass(frozen=True)
 class Machine:
-    """What moves: inertia, drive and effects.
+    """Moving part: inertia, drive and effects.
 
     Attributes:
         inertia: Mass or moment of inertia [kg].
@@ -99,7 +99,7 @@ class Machine:
 
 @dataclasses.dataclass(frozen=True)
 class Loop:
-    """What gives the command.
+    """Source of the command.
 
     Attributes:
         kind: open_loop, cascade_pd, pd, pid or friction_compensation.
@@ -138,7 +138,7 @@ class Loop:
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """What is read: the loop and the log see the same position reading.
+    """Readings: the loop and the log see the same position reading.
 
     Attributes:
         position_resolution: Step to which the reading is rounded, 0 for none [m].
