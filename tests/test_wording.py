@@ -1,4 +1,4 @@
-"""Docstrings and comments of jaxid are in the field's words; see `tests/wording.py`."""
+"""Docstrings and comments are in the words of the field; see `tests/wording.py`."""
 
 import pytest
 
@@ -18,6 +18,13 @@ def test_few_words_that_make_an_engineer_stumble(count, word):
 
 def test_functions_begin_with_a_verb(count):
     assert count.functions > 1000
+    assert count.share_without_verb <= MOST_WITHOUT_VERB, "\n".join(count.without_verb)
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "experiments", "truth"])
+def test_functions_beside_the_package_begin_with_a_verb(folder):
+    count = counted(PACKAGE.parent / folder)
+    assert count.functions > 50
     assert count.share_without_verb <= MOST_WITHOUT_VERB, "\n".join(count.without_verb)
 
 

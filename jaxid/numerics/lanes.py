@@ -209,7 +209,7 @@ def solved_together(requests: Sequence[SolveRequest]) -> Steps[list[Any]]:
 
 
 class _Key(NamedTuple):
-    """What is common to requests that are solved together: all but the values of their arrays."""
+    """Common part of requests that are solved together: all but the values of their arrays."""
 
     function: Callable
     structure: Any
