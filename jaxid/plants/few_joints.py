@@ -20,8 +20,9 @@ from jaxid.arrays import Array
 from jaxid.plants.geometry import Geometry
 from jaxid.plants.rigid_tree import Tree, inverse_dynamics
 
-# Joints up to which this takes less time than the recursion: coefficients are five times as many per joint.
-MOST_JOINTS = 3
+# Joints up to which this is known to take less time than the recursion: coefficients are five times as many
+# for each joint more.
+MOST_JOINTS = 2
 
 
 class FewJoints(eqx.Module):

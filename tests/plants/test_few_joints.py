@@ -1,5 +1,6 @@
 """Polynomials of a chain of few joints: forces and their derivatives are those of Pinocchio."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,7 +56,9 @@ def test_forces_and_their_slopes_are_pinocchios(revolute):
 def test_a_long_chain_and_links_that_follow_keep_the_recursion():
     def prepared(n, **more):
         _, geometry, parameters, _ = drawn((True,) * n)
-        return SerialArm(*parameters.T, geometry=geometry, **more).prepared()
+        arm = SerialArm(*parameters.T, geometry=geometry, **more)
+        # Shapes tell: no operation is compiled.
+        return eqx.filter_eval_shape(lambda arm: arm.prepared(), arm)
 
     assert prepared(MOST_JOINTS).polynomials is not None
     assert prepared(MOST_JOINTS + 1).polynomials is None
