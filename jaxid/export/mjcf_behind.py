@@ -81,6 +81,7 @@ class BehindJoints:
         own["stiffness"] = stiffness if gap is None else "0"
         self.text.insert_behind(element, _tag("joint", own))
         if gap is not None:
+            # Damping cannot be left to the ends of a clearance. Without any the motion is further off.
             half = 0.5 * float(gap)
             band = {"name": name, "springlength": f"{-half!r} {half!r}", "stiffness": stiffness}
             only = _tag("joint", {"joint": name, "coef": "1"})
