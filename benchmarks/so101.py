@@ -249,14 +249,15 @@ def main() -> None:
         parser.error("set JAXID_DATA to the folder of the measured data")
     data = Path(os.environ["JAXID_DATA"]) / "so101"
     kept = args.o / "so101.json"
-    content = json.loads(kept.read_text()) if kept.exists() else {"joints": []}
-    model = mujoco.MjModel.from_xml_path(str(data / "so101.xml"))
-    model.opt.timestep = STEP
     logs = motions(data)
-    if "compared" not in content or not args.joint:
-        content["compared"] = compared(model, logs)
     for joint in args.joint or range(1, len(JOINTS) + 1):
         record = run(joint, logs)
+        # Read now: another joint may have ended meanwhile.
+        content = json.loads(kept.read_text()) if kept.exists() else {"joints": []}
+        if "compared" not in content:
+            model = mujoco.MjModel.from_xml_path(str(data / "so101.xml"))
+            model.opt.timestep = STEP
+            content["compared"] = compared(model, logs)
         content["joints"] = [r for r in content["joints"] if r["joint"] != joint] + [record]
         content |= {"commit": commit_of(ROOT), "date": date.today().isoformat()}
         kept.write_text(json.dumps(content, indent=1) + "\n")
