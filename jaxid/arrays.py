@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     import jax
@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     Array = jax.Array | np.ndarray
 else:
     from jaxtyping import Array as Array
+
+# Array of the same library as another one.
+A = TypeVar("A", bound="Array")
 
 
 def library(*values: Any) -> Any:

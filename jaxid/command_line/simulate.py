@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         simulated_log = simulate(case, seed=args.seed)
         figure = None if picture is None else motion_picture(case, simulated_log)
     simulated_log.save(path)
-    if figure is not None:
+    if picture is not None and figure is not None:
         figure.savefig(picture, dpi=160)
         print(f"wrote {picture}")
     print(f"{simulated_log.log.samples} samples at {simulated_log.log.rate_hz:g} Hz in {path}")

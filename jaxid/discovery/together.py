@@ -83,7 +83,7 @@ def _needed(search: Search, theta: np.ndarray, laws: list[cand.Candidate]) -> li
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     gram, strengths = (columns / size).T @ (columns / size), theta[active] * size
     first = len(search.superset.base)
-    here = list(range(len(active)))
+    here, cost = list(range(len(active))), np.zeros(len(active))
     while len(here) > first:
         inverse = np.linalg.pinv(gram[np.ix_(here, here)], hermitian=True)
         cost = strengths[here] ** 2 / np.maximum(np.diag(inverse), 1e-300)

@@ -58,7 +58,8 @@ def coarse_starts(
     kept = points[np.unique(np.append(ranked[: _FINALISTS - 1], 0))]
     signals = [float(np.linalg.norm(part.log.filled - part.log.filled.mean(axis=0))) for part in parts]
     weights = start_weights(signals, [part.log.filled.size for part in parts])
-    costs = np.sum([w * _costs_along(*of, kept) for w, *of in zip(weights, parts, numerics, strict=True)], 0)
+    logs = zip(weights, parts, numerics, strict=True)
+    costs = np.sum([weight * _costs_along(part, stated, kept) for weight, part, stated in logs], axis=0)
     return list(kept[np.argsort(costs, kind="stable")[: count + 1]])
 
 

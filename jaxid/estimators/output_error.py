@@ -7,7 +7,7 @@ noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -377,21 +377,28 @@ class _Fit:
             return (yield from descent_steps(evaluate, x, scale.bounds, **options))
 
         x = scale.inward(theta, starts)
-        if self.unforced:
-            # Without a force the model may be far from complete. Its errors have a colour that is none of the
-            # noise, and would make a log count for nothing: readings then weigh alike.
-            alike = np.full(len(self.outputs), 1.0 / np.mean(1.0 / weights))
-            found = yield from fit(x, alike)
-            x = found.x
-        if not self.unforced or (found.model.finite and self.noise_limited(found.model.content)):
-            found, weights = yield from descended_steps(fit, x, weights)
-        elif found.model.finite:
-            weights = _pooled(found.model.content)
-            found = yield from fit(x, weights)
+        descended = self._descended_unforced if self.unforced else descended_steps
+        found, weights = yield from descended(fit, x, weights)
         model, finite = found.model, bool(np.isfinite(found.model.cost))
         failure = _DIVERGED if not finite else f"no convergence within {found.steps} steps"
         ended = (weights, found.converged and finite, failure, found.steps)
         return _End(*scale.outward(found.x), theta, model.cost, model.content, *ended)
+
+    def _descended_unforced(
+        self, fit: Callable[[np.ndarray, np.ndarray], Steps[Descent]], x: np.ndarray, weights: np.ndarray
+    ) -> Steps[tuple[Descent, np.ndarray]]:
+        """Descend as `descended_steps` does if the noise limits the fit; else readings weigh alike.
+
+        Without a force the model may be far from complete. Its errors have a colour that is none of the
+        noise, and would make a log count for nothing.
+        """
+        found = yield from fit(x, np.full(len(self.outputs), 1.0 / np.mean(1.0 / weights)))
+        if not found.model.finite:
+            return found, weights
+        if self.noise_limited(found.model.content):
+            return (yield from descended_steps(fit, found.x, weights))
+        weights = _pooled(found.model.content)
+        return (yield from fit(found.x, weights)), weights
 
     def _rows(
         self, theta: np.ndarray, starts: np.ndarray, signals: Sequence[float], weights: np.ndarray

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.signal
 
-from jaxid.arrays import Array, library
+from jaxid.arrays import A, Array, library
 from jaxid.errors import InputError
 from jaxid.logs.log import Log, integral
 from jaxid.numerics import filters as signals
@@ -443,16 +443,16 @@ def counted(
         recipe: Settings of the filter.
         measured: Whether each joint has an encoder.
     """
-    kept = recipe.decimator.kept(len(qd))
+    kept, seen = recipe.decimator.kept(len(qd)), np.asarray(measured)
     at_rest = np.abs(qd) < np.asarray(recipe.rest_velocity)
     reach = recipe.decimator.reach
     if recipe.keeps_reversals:
-        fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & measured
-        return ~smeared(at_rest, reach)[kept] & measured, fitted
+        fitted = ~smeared(lasting(at_rest, 2 * recipe.decimation), reach)[kept] & seen
+        return ~smeared(at_rest, reach)[kept] & seen, fitted
     turns = turning(qd)
     reach = affordable(at_rest, turns, max(reach, recipe.decimation - 1))
     # An axis that swings faster than the filter's reach has only reversals: they are kept.
-    moving = ~smeared(at_rest | (turns & (reach > 0)), reach)[kept] & measured
+    moving = ~smeared(at_rest | (turns & (reach > 0)), reach)[kept] & seen
     return moving, moving
 
 
@@ -495,13 +495,13 @@ def _nearer(reach: int) -> list[int]:
     return [int(np.ceil(part * reach)) for part in (1.0, 0.75, 0.5, 0.25)]
 
 
-def spares(at_rest: Bool[Array, "time n"], turning: Bool[Array, "time n"], reach: int) -> Any:
+def spares(at_rest: Bool[Array, "time n"], turning: Bool[Array, "time n"], reach: int) -> Bool[Array, ""]:
     """Check that most of the motion remains if so many samples around stops and reversals are omitted."""
     lost = smeared(at_rest | turning, reach) & ~at_rest
     return (lost.sum(axis=0) < _MOSTLY * (~at_rest).sum(axis=0).clip(1)).all()
 
 
-def turning(v: Float[Array, "time n"]) -> Bool[Array, "time n"]:
+def turning(v: Float[A, "time n"]) -> Bool[A, "time n"]:
     """Mark the samples between which a velocity changes its sign: a fast reversal has none at rest."""
     xp = library(v)
     signs = xp.sign(v)
@@ -510,7 +510,7 @@ def turning(v: Float[Array, "time n"]) -> Bool[Array, "time n"]:
     return xp.concatenate([turns, edge]) | xp.concatenate([edge, turns])
 
 
-def smeared(flags: Bool[Array, "time n"], reach: int) -> Bool[Array, "time n"]:
+def smeared(flags: Bool[A, "time n"], reach: int) -> Bool[A, "time n"]:
     """Mark flags and their neighbours: the parallel filter spreads a stop over them."""
     width, beyond = 2 * reach + 1, np.zeros((reach, flags.shape[1]), bool)
     out, joined = library(flags).concatenate([beyond, flags, beyond]), 1

@@ -290,7 +290,7 @@ def _held_against_case(session: Session, *, several: bool, chooses_hold: bool) -
     )
 
 
-def _with_force_noise(opened: OpenedLog, noise: np.ndarray) -> OpenedLog:
+def _with_force_noise(opened: OpenedLog, noise: np.ndarray | None) -> OpenedLog:
     return replace(opened, data=replace(opened.data, force_noise=noise))
 
 

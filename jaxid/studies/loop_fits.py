@@ -11,6 +11,7 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Generic
 
 import equinox as eqx
 import jax
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxid.arrays import Array
+from jaxid.arrays import A, Array
 from jaxid.controllers import Controller
 from jaxid.estimators.common.levenberg_marquardt import Transform, levenberg_marquardt
 from jaxid.estimators.common.shapes import shapes
@@ -50,6 +51,9 @@ _SURELY = 0.5
 _LANES = 8
 # First samples that the velocity at the start is read from.
 _HEAD = 64
+
+# Position, velocity, acceleration, force, and whether a kept sample counts, as in `ForceData`.
+_Motion = tuple[Array, Array, Array, Array, Array]
 
 
 class _Level(eqx.Module):
@@ -125,7 +129,7 @@ class _Level(eqx.Module):
         )
 
 
-class _Found(eqx.Module):
+class _Found(eqx.Module, Generic[A]):
     """Results of the program, by run.
 
     Args:
@@ -137,14 +141,14 @@ class _Found(eqx.Module):
         balance: Matrix J'J of the balance, (runs, p, p); its cost (runs,), and size of the force (runs,).
     """
 
-    theta: Float[Array, "runs p"]
-    steps: Array
-    gram: Float[Array, "runs p p"]
-    meat: Float[Array, "runs p p"]
-    signal: Float[Array, " runs"]
-    tracking: Float[Array, "runs drives 2"]
-    good: Bool[Array, " runs"]
-    balance: tuple[Float[Array, "runs p p"], Float[Array, " runs"], Float[Array, " runs"]]
+    theta: Float[A, "runs p"]
+    steps: A
+    gram: Float[A, "runs p p"]
+    meat: Float[A, "runs p p"]
+    signal: Float[A, " runs"]
+    tracking: Float[A, "runs drives 2"]
+    good: Bool[A, " runs"]
+    balance: tuple[Float[A, "runs p p"], Float[A, " runs"], Float[A, " runs"]]
 
 
 @dataclass(frozen=True)
@@ -220,13 +224,13 @@ class LoopFits:
     def _fitted(self, drawn: Sequence[Draw], lanes: int) -> tuple[np.ndarray, Arrays]:
         """Fit the runs of one call; fewer than its lanes are filled up, so that one shape serves all."""
         filled = [*range(len(drawn)), *[len(drawn) - 1] * (lanes - len(drawn))]
-        truth, start = (np.stack([drawn[k][part] for k in filled]) for part in (0, 1))
+        truth, start = np.stack([drawn[k][0] for k in filled]), np.stack([drawn[k][1] for k in filled])
         bounds = self.machine.parameters.bounds_at(start)
         noise = self._noise(drawn, lanes)
         # An accelerator has memory for one chunk; on a processor each thread has its own.
         with self._device if accelerator() else contextlib.nullcontext():
-            found: _Found = jax.tree.map(np.asarray, _program(self.level, truth, start, bounds, *noise))
-        found = jax.tree.map(lambda x: x[: len(drawn)], found)
+            filled_up = _program(self.level, truth, start, bounds, *noise)
+            found: _Found[np.ndarray] = jax.tree.map(lambda x: np.asarray(x)[: len(drawn)], filled_up)
         std, known = deviations(found.gram, found.meat, found.signal, _scale(found.theta))
         identifiable = np.ones(std.shape, bool)
         good = found.good & _identified(start[: len(drawn)], *found.balance)
@@ -295,7 +299,7 @@ def _program(
     bounds: tuple[Float[Array, "runs p"], Float[Array, "runs p"]],
     noise: Float[Array, "runs ticks n"],
     noise_of_command: Float[Array, "runs time m"],
-) -> _Found:
+) -> _Found[Array]:
     """Simulate, read, filter and fit all runs, and sum up what their intervals need."""
     every, period = level.replay.every, level.replay.drive.period * level.replay.every
     position, command, reading = (x[::every] for x in _simulated(level, truth, noise))
@@ -304,15 +308,15 @@ def _program(
     rows = jnp.moveaxis(reading, 0, -1).reshape(runs * n, time)
 
     smooth = spectral_rows(rows, period, level.recipe.cutoff_hz)
-    motion = [jnp.swapaxes(x.reshape(runs, n, time), 1, 2) for x in smooth]
-    counts, same = jax.vmap(lambda qd: counted_as(qd, level.recipe, level.reach))(motion[1])
-    arrays = (*motion, jnp.swapaxes(force, 0, 1) * level.gain, counts.astype(float))
+    q, qd, qdd = (jnp.swapaxes(x.reshape(runs, n, time), 1, 2) for x in smooth)
+    counts, same = jax.vmap(lambda v: counted_as(v, level.recipe, level.reach))(qd)
+    arrays = (q, qd, qdd, jnp.swapaxes(force, 0, 1) * level.gain, counts.astype(float))
     begun, balance, solved = _started(level, start, bounds, arrays)
 
     std = high_band_std_of_rows(rows)
     velocity = line_at(reading[:_HEAD].reshape(-1, runs * n), period, 0, std)[1].reshape(runs, n)
     rms = lambda v: jnp.sqrt(jnp.mean(v**2))
-    speed = jax.vmap(lambda v: typical_velocity(level.model, v, rms))(motion[1])
+    speed = jax.vmap(lambda v: typical_velocity(level.model, v, rms))(qd)
     ends = _ends(level, reading, (reading[0], velocity, speed), begun, bounds)
 
     models = autoregressions(jnp.moveaxis(ends.residual, 0, -1).reshape(runs * n, time))
@@ -350,14 +354,14 @@ def _simulated(
 
 
 def _started(
-    level: _Level, start: Float[Array, "runs p"], bounds: tuple[Array, Array], arrays: tuple
+    level: _Level, start: Float[Array, "runs p"], bounds: tuple[Array, Array], arrays: _Motion
 ) -> tuple[Array, tuple[Array, Array, Array], Array]:
     """Return estimates of inverse dynamics, its sums as `_Found.balance` has them, and its convergence."""
     plant = level.model.smoothed(np.asarray(1 / 3), level.rest_velocity)
     period, decimator = level.replay.drive.period * level.replay.every, level.recipe.decimator
     every = (True,) * arrays[0].shape[2]
 
-    def one(theta: Array, lower: Array, upper: Array, arrays: tuple) -> tuple:
+    def one(theta: Array, lower: Array, upper: Array, arrays: _Motion) -> tuple:
         data = ForceData(*arrays, jnp.zeros(()), period, level.hold, decimator, every)
 
         def balance(x: Array) -> Array:

@@ -39,6 +39,9 @@ _FARTHEST = 5.0
 # True values of a run, the start of its fit, and the generator of its noise.
 Draw = tuple[np.ndarray, np.ndarray, np.random.Generator]
 
+# Value, lower and upper bound of each parameter.
+_Centre = tuple[np.ndarray, np.ndarray, np.ndarray]
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -167,11 +170,10 @@ class Plan:
         return truth, started, rng
 
     @functools.cached_property
-    def _centres(self) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    def _centres(self) -> tuple[_Centre, _Centre]:
         """Value, lower and upper bound of each parameter of the simulated machine, and of the model."""
-        both = (self.scene.machine.parameters, self.machine.parameters)
-        true, guess = ((p.guess, *p.bounds) for p in both)
-        return true, guess
+        true, guess = self.scene.machine.parameters, self.machine.parameters
+        return (true.guess, *true.bounds), (guess.guess, *guess.bounds)
 
     @property
     def manifest(self) -> dict:

@@ -153,7 +153,7 @@ class Runner:
     ) -> Arrays:
         """Return the arrays of one run, whose joints followed a reference so, (time, n)."""
         driven = self.plan.levels[level].machine.plant.driven(followed.shape[1])
-        return _run_arrays(rows, tracking_of(reference, followed[:, list(driven)]))
+        return _run_arrays(rows, np.asarray(tracking_of(reference, followed[:, list(driven)])))
 
     def _all_failed(self, error: Exception) -> Arrays:
         drives = 0 if self.plan.machine.controller is None else self.plan.machine.gain.size

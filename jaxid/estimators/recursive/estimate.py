@@ -148,7 +148,7 @@ def recursive_steps(
         recursion, memory = _continued(recursion, saved)
     course = yield from _run_along(recursion, memory, logs, settings)
 
-    theta = course.history.theta[-1]
+    theta = np.asarray(course.history.theta[-1])
     precision, inflation = precision_of(
         machine,
         used,

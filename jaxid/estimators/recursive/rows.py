@@ -190,4 +190,4 @@ def gated(data: Prepared, velocity: np.ndarray, acceleration: np.ndarray) -> Boo
         velocity, acceleration: Gates by joint, one of which a sample must exceed [m/s, m/s^2 or in rad].
     """
     stuck = (np.abs(data.qd) <= velocity) & (np.abs(data.qdd) <= acceleration)
-    return ~smeared(stuck, data.recipe.decimator.reach)[data.kept] & data.measured
+    return ~smeared(stuck, data.recipe.decimator.reach)[data.kept] & np.asarray(data.measured)
