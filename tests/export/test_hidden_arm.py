@@ -5,13 +5,10 @@ import numpy as np
 import pytest
 
 import jaxid
-from jaxid.commands.discover import start_search
 from jaxid.commands.export import check_export, export
 from jaxid.commands.robot_case import RobotCase
-from jaxid.discovery.refit import refit_of
 from jaxid.export.exported import ExportedFile
 from jaxid.results.as_json import identification_json
-from jaxid.session import open_session
 from tests.support.hidden_arm import HIDDEN, JOINTS, arm_log, true_file, user_file
 from tests.support.written_logs import write_csv
 
@@ -95,16 +92,3 @@ def test_discover_names_all_that_the_file_lacks(files):
     assert {e.label for e in found.effects} == {name.split(".")[0] for name in expected}
     for name, true in expected.items():
         assert values[name] == pytest.approx(true, rel=0.01), name
-
-
-@pytest.mark.slow
-def test_an_open_loop_that_runs_away_is_not_refitted(files):
-    robot, log = files
-    tables = RobotCase.of(str(robot), [str(log)], search=True).tables | {"output_error": {}}
-    # As a search has it on its way: one of the two terms of the spring.
-    tables["effects"] = [{"kind": "constant_force", "joint": 3, "level": {"guess": 1.0}}]
-    session = open_session(tables, log, (), align_hold=True, method="discover")
-    baseline, _ = start_search(session)
-    kept = refit_of(session, baseline)
-    assert kept.notes[-1] == "not refitted in simulation: the simulated motion runs away from the log"
-    assert np.array_equal(kept.theta, baseline.theta)
