@@ -144,7 +144,8 @@ def run(joint: int, logs: dict[str, np.ndarray]) -> dict[str, Any]:
         "seconds": round(seconds, 1),
         "converged": result.estimate.converged,
         "parameters": {
-            name: {"value": p.value, "std": p.std, "unit": p.unit} for name, p in result.parameters.items()
+            name: {"value": _number(p.value), "std": _number(p.std), "unit": p.unit}
+            for name, p in result.parameters.items()
         },
         "rms": {name: None if s is None else 1e3 * float(s.rms[0]) for name, s in {**fitted, **left}.items()},
         "shown": shown,
@@ -219,6 +220,7 @@ def table(content: dict[str, Any]) -> str:
     lines += [
         "",
         f"In {' and '.join(TOUCHING)} the arm touches the table, which a joint alone does not know.",
+        "Which motions are fitted was decided with all twelve in view, and so was the model.",
     ]
     lines += ["", "By motion:", "", f"| joint | {' | '.join([*left, *FITTED])} |"]
     lines.append("|---" * (len(names) + 1) + "|")
@@ -235,9 +237,16 @@ def table(content: dict[str, Any]) -> str:
             found = record["parameters"].get(name)
             unit = found["unit"] if found else unit
             known = found is not None and found["value"] is not None
-            cells.append(f"{found['value']:.3g} ({found['std']:.2g})" if found and known else "-")
+            cells.append(
+                f"{found['value']:.3g} ({found['std']:.2g})" if found and known else "not identifiable"
+            )
         lines.append(f"| {name} [{unit}] | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _number(x: float) -> float | None:
+    """Return a number, or None where it is not finite: JSON has no such numbers."""
+    return x if np.isfinite(x) else None
 
 
 def main() -> None:
