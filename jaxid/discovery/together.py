@@ -11,8 +11,6 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import SUPERFLUOUS, Model, Search, Step
 
-# What a robot's file has room for at a joint, and often lacks; one strength each.
-_LAWS = ("coulomb_friction", "viscous_friction", "constant_force", "linear_stiffness", "added_mass")
 # Laws take the place of what was found one by one if they close this part of the gap that is left.
 _NEARLY_ALL = 0.9
 
@@ -36,7 +34,8 @@ def add_together(search: Search, steps: list[Step], most: int) -> list[Step]:
     old = search.model
     if most < 1 or search.data.q.shape[1] < 2 or search.acceptance.at_floor(old.theta):
         return steps
-    laws = [c for c in search.rest(Model((), old.theta)) if c.kind in _LAWS]
+    rest = search.rest(Model((), old.theta))
+    laws = [c for c in rest if cand.effect_of(search.superset, c).in_robot_file]
     if len(laws) < 2:
         return steps
     search.progress("fitting friction, springs and rotors of all joints at once")

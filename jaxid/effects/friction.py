@@ -20,6 +20,7 @@ class ViscousFriction(Effect):
     met = "lubricated guides, bearings and seals, and eddy currents"
     part = "load"
 
+    in_robot_file = True
     without_force = True
 
     any_direction = True
@@ -64,6 +65,7 @@ class CoulombFriction(Effect):
     met = "guides, bearings and seals under preload, brushes and brakes"
     part = "load"
 
+    in_robot_file = True
     without_force = True
 
     sliding_level = "level"

@@ -17,6 +17,8 @@ class AddedMass(Effect):
     met = "tools, payloads, rotors behind a gear, forgotten parts"
     part = "load"
 
+    in_robot_file = True
+
     any_direction = True
 
     mass: Array = parameter("inertia", "free", "m")

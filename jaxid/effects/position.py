@@ -20,6 +20,7 @@ class ConstantForce(Effect):
     met = "weight balances, cable chains, an offset of the drive, friction that differs by direction"
     part = "load"
 
+    in_robot_file = True
     without_force = True
 
     level: Array = parameter("force", "free", "F0")
@@ -37,6 +38,7 @@ class LinearStiffness(Effect):
     met = "flexures, hoses, cable chains, bellows"
     part = "gear"
 
+    in_robot_file = True
     without_force = True
 
     of_spring = True

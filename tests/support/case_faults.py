@@ -223,7 +223,7 @@ FAULTS = {
     ),
     "align_hold": (more("[preprocess]\nalign_hold = 1"), ["align_hold", "true or false"]),
     # controller
-    "gain of another": (more("kd = 3.0"), ["[controller]", "'kd'", "there is: kind, kp, kv"]),
+    "gain of another": (more("kd = 3.0"), ["[controller]", "'kd'", "there is: kind, acceleration, kp, kv"]),
     "period": (swapped("0.001", "0.0"), ["period = 0.0", "> 0"]),
     "average": (more("velocity_average = 0"), ["velocity_average = 0", "at least 1"]),
     "limit": (more("limit = -3"), ["limit = -3", "> 0"]),
