@@ -102,6 +102,7 @@ def test_friction_of_every_hinge_and_drive_gains_come_back(session, method):
         assert std < 0.05 * max(TRUTH[name], 0.3), name
 
 
+@pytest.mark.slow
 def test_payload_is_told_by_the_tip_or_by_an_effect_on_the_tool(robot, tmp_path):
     """With the gains known: they and the masses together are any multiple of both."""
     log = write_csv(tmp_path / "log.csv", followed(dataclasses.replace(robot, tip_mass=3.4), **NOISE))

@@ -210,7 +210,12 @@ def test_the_file_is_what_the_classes_say():
     assert kinds.FILE.read_text(encoding="utf-8") == kinds.text_of(kinds.declarations())
 
 
-@pytest.mark.parametrize("name", TEXTS)
+QUICK = ("chain", "arm", "stage", "loop", "steady", "docs/examples/axis.toml")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in TEXTS]
+)
 def test_every_fault_is_refused_in_the_same_words(name):
     tables = tomllib.loads(TEXTS[name])
     folder = (ROOT / name).parent if name.endswith(".toml") else ROOT

@@ -57,7 +57,8 @@ def test_what_a_quiet_log_shows_is_named(tmp_path):
     assert "velocity_hysteresis[2]" in (tmp_path / "out" / "report.html").read_text()
 
 
-@pytest.mark.parametrize("resolution", [0.0, pytest.param(stages.COUNT, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("resolution", [0.0, stages.COUNT])
 def test_a_move_of_four_counts_lacks_nothing_that_it_could_show(tmp_path, resolution):
     """Data 2: no sample is faster than its rest, and there is no balance of forces to look at."""
     log = logged(2, noise=0.01, resolution=resolution)

@@ -204,6 +204,7 @@ def stage(tmp_path, more: str = ""):
     return jaxid.identify(tmp_path / "case.toml", directions.logged(0)).estimate
 
 
+@pytest.mark.slow
 def test_a_fit_within_a_prior_takes_any(tmp_path):
     """Named in the case; identifiable directions end within a hundredth of their standard deviation."""
     here = stage(tmp_path)

@@ -67,6 +67,7 @@ def test_every_method_gives_the_published_parameters(emps, method):
     assert pulses.simulation.relative[0] <= 1.5e-5
 
 
+@pytest.mark.slow
 @needs_data
 def test_output_error_sees_the_hold_that_the_published_recipe_does_not(emps):
     """Half a sample is 2 % of the viscous friction; told of it, inverse dynamics says the same."""

@@ -297,6 +297,7 @@ print(time.perf_counter() - start, peak() - before, log.samples)
 """
 
 
+@pytest.mark.slow
 def test_a_million_rows(tmp_path):
     count = 1_000_000
     rng = np.random.default_rng(0)

@@ -174,6 +174,7 @@ def test_known_entries_keep_their_place_in_lists(tmp_path):
     assert [s is None for s in entry["std"]] == [True, False, True]
 
 
+@pytest.mark.slow
 def test_friction_of_an_exact_stepper_is_recovered(tmp_path):
     """Closed loop, one mass of two driven: the controller sees that mass alone."""
     case = ChainCase("null", "chain2", 1.0, 11)

@@ -307,6 +307,7 @@ def test_base_parameters_are_of_positions_that_can_be():
     np.testing.assert_allclose(rows @ found.of(plant), plant.inertial(*state), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_lengths_that_close_nowhere_are_refused():
     plant = plant_of(dataclasses.replace(UNEVEN, length=(3.0, 0.24, 0.27, 0.26, 0.23)))
     with pytest.raises(InputError, match="five_bar' cannot take any position; check its lengths"):

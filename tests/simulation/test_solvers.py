@@ -105,7 +105,7 @@ def run_and_slopes(numerics: Numerics, closed: bool, hold: str) -> tuple[np.ndar
         (False, "zero_order", "dopri8"),
         (False, "band_limited", "tsit5"),  # which is linear between refined samples
         (True, "zero_order", "tsit5"),
-        (True, "zero_order", "kvaerno5"),
+        pytest.param(True, "zero_order", "kvaerno5", marks=pytest.mark.slow),
     ],
 )
 def test_runs_and_their_derivatives_are_those_of_fine_steps(closed, hold, name):
@@ -138,7 +138,7 @@ def test_interval_by_interval_is_the_whole_log_at_once():
     np.testing.assert_allclose(np.asarray(run), np.asarray(whole), atol=1e-7 * np.ptp(whole))
 
 
-@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("closed", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_estimates_through_diffrax_are_those_of_fine_steps(closed):
     # Lag and delay of a few samples are hard to tell apart, and this is no test of that.
     m, data = machine(closed, ("inertia", "viscous", "dry", "lag")), log(closed)

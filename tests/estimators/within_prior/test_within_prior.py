@@ -92,7 +92,8 @@ def test_all_starts_end_alike_below_the_truth(fitted, folder):
     assert details["criterion_percent"] < at_truth < 0.2 * at_guess
 
 
-@pytest.mark.parametrize("method", [pytest.param("inverse_dynamics", marks=pytest.mark.slow), "recursive"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["inverse_dynamics", "recursive"])
 def test_what_another_method_finds_is_a_start_too(fitted, folder, tmp_path, method):
     """On a hundred samples neither tells the unknowns: far off as it is, the fit ends where it did."""
     text = (folder / "case.toml").read_text() + f'start = "{method}"\n'
