@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxid.discovery import candidates as cand
@@ -12,21 +14,32 @@ from jaxid.machine import Machine
 from jaxid.model.unknowns import free_effect
 
 
+def machine_with(
+    machine: Machine, superset: cand.CandidateModel, added: Sequence[cand.Candidate], theta: np.ndarray
+) -> tuple[Machine, list[tuple[str, ...]]]:
+    """Return the case's machine with only some effects, at values of the superset's unknowns.
+
+    The names of each effect's unknowns are returned too.
+    """
+    plant, parameters = machine.plant, machine.parameters
+    values, names = [*theta[superset.base]], []
+    for c in added:
+        effect = cand.effect_at(superset, c, theta[c.index])
+        plant, free = free_effect(plant, effect, machine.units)
+        parameters = parameters.extended(free)
+        values.extend(theta[c.index])
+        names.append(tuple(f.name for f in free))
+    return machine.with_plant(plant, parameters).with_estimate(np.asarray(values)), names
+
+
 def final_machine(
     machine: Machine, search: Search, alternatives: dict[int, tuple[Score, ...]], steps: list[Step]
 ) -> tuple[Machine, tuple[NamedEffect, ...]]:
     """Return the case's machine with only the effects that were added, at their refitted values."""
-    plant, parameters = machine.plant, machine.parameters
-    theta = [*search.theta[search.superset.base]]
+    final, named = machine_with(machine, search.superset, search.added, search.theta)
     effects = []
-    for k, c in enumerate(search.added):
-        effect = cand.effect_at(search.superset, c, search.theta[c.index])
-        plant, free = free_effect(plant, effect, machine.units)
-        parameters = parameters.extended(free)
-        theta.extend(search.theta[c.index])
+    for k, (c, names) in enumerate(zip(search.added, named, strict=True)):
         score = next(s.added for s in reversed(steps) if s.added and s.added.candidate is c)
-        names = tuple(f.name for f in free)
-        place = plant.place(c.port)
+        place = final.plant.place(c.port)
         effects.append(NamedEffect(c.kind, c.label, place, names, score, alternatives.get(k, ())))
-    final = machine.with_plant(plant, parameters).with_estimate(np.asarray(theta))
     return final, tuple(effects)

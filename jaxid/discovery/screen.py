@@ -93,7 +93,10 @@ def screen_candidates(search: Search, model: Model, *, ahead: bool = False) -> S
     white, columns = whitener(e[..., None]), whitener(base)
 
     length = ev.stretch(out.rows)
-    surrogates = ev.flipped(noise, length, _SURROGATES, np.random.default_rng(20240501))
+    surrogates = [ev.flipped(noise, length, _SURROGATES, np.random.default_rng(20240501))]
+    drawn = search.drawn_noise(model, _SURROGATES)
+    if drawn is not None:
+        surrogates.append(whitener(np.moveaxis(drawn, 0, -1)))
     _score(out, search, white, columns, surrogates, points)
     if ahead:
         out.pairs = score_pairs(columns, white, _points_to_pair(out, points, columns), out.blocks)
@@ -170,10 +173,11 @@ def _score(
     search: Search,
     white: np.ndarray,
     base: np.ndarray,
-    surrogates: np.ndarray,
+    kinds: list[np.ndarray],
     points: list[cand.Point],
 ) -> None:
-    """Score every candidate at its best start, and set the threshold from the surrogates."""
+    """Score every candidate at its best start, and set the threshold: the largest by a kind of surrogates."""
+    surrogates = np.concatenate(kinds, axis=1)
     beside = ev.Beside(base, np.concatenate([white, surrogates], axis=1), out.blocks)
     null_before = out.held_out_rows(base, surrogates)
     largest = np.full(surrogates.shape[1], -np.inf)
@@ -198,7 +202,8 @@ def _score(
 
     scores = [replace(s, second=alone[k][1]) if k in alone else s for k, s in best.items()]
     out.scores = sorted(scores, key=lambda s: -s.evidence)
-    out.threshold = ev.threshold(largest)
+    ends = np.cumsum([k.shape[1] for k in kinds])[:-1]
+    out.threshold = max(ev.threshold(some) for some in np.split(largest, ends))
 
 
 def _with_products(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
@@ -137,6 +138,14 @@ class Search:
         """Return the indices of the unknowns that a model with some effects fits."""
         return np.concatenate([self.superset.base, *[c.index for c in effects]]).astype(int)
 
+    def renewed(self, model: Model) -> Model:
+        """Return a model whose noise was estimated anew; that of forces is known beforehand."""
+        return model
+
+    def drawn_noise(self, model: Model, runs: int) -> Float[np.ndarray, "runs kept n"] | None:
+        """Draw residuals by simulated noise; None: surrogates have the residual with other signs."""
+        return None
+
     def rest(self, model: Model | None = None) -> list[cand.Candidate]:
         """Return the candidates that a model, by default the current one, may still get."""
         gone = [*(self.model if model is None else model).added, *self.barred]
@@ -149,8 +158,8 @@ class Search:
             most: Largest number of effects in the model.
         """
         self.progress("fitting the baseline")
-        self.baseline = self.fit(self.model.theta, self.active)
-        self.model = Model((), self.baseline)
+        self.model = self.renewed(Model((), self.fit(self.model.theta, self.active)))
+        self.baseline = self.model.theta
         first = self.step(self.model)
         self.model, steps = self.grow(self.model, most)
         return [first, *steps]
@@ -201,6 +210,7 @@ class Search:
             for score in best:
                 model = Model((*model.added, score.candidate), score.refitted)
                 steps.append(self.step(model, added=score, scores=scores, threshold=limit))
+            model = self.renewed(model)
             model, dropped = self.drop_superfluous(model, limit, model.added[:-1])
             steps.extend(dropped)
 

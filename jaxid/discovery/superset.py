@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
 from jaxid.discovery.candidates import Candidate, CandidateModel
@@ -24,8 +24,16 @@ from jaxid.numerics.kept import kept_jit
 from jaxid.simulation.force_balance import ForceData, sharpened, whole_motion
 
 
-def scales_of(plant: Plant, data: Prepared) -> tuple[Scales, ...]:
-    """Compute the scales of motion and force in a prepared log, by port of a plant."""
+def scales_of(
+    plant: Plant, data: Prepared, between: Float[np.ndarray, " m"] | None = None
+) -> tuple[Scales, ...]:
+    """Compute the scales of motion and force in a prepared log, by port of a plant.
+
+    Args:
+        plant: The plant.
+        data: The log.
+        between: Largest absolute force of each drive between the rows of the log, (m,); None: not known.
+    """
     y, yd, ydd = (np.asarray(a) for a in _port_motion(plant, ForceData.of(data)))
     n, drives = data.q.shape[1], data.force.shape[1]
     force = data.force - np.mean(data.force, axis=0)
@@ -49,6 +57,7 @@ def scales_of(plant: Plant, data: Prepared) -> tuple[Scales, ...]:
                 peak_force=float(np.abs(data.force[:, drive_columns]).max()),
                 period=data.period,
                 duration=data.period * len(data.q),
+                between=0.0 if between is None else float(np.max(between[drive_columns])),
             )
         )
     return tuple(scales)
@@ -61,7 +70,10 @@ def _port_motion(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
 
 
 def build_candidate_model(
-    machine: Machine, data: Prepared, effects: Sequence[type[Effect]] | None = None
+    machine: Machine,
+    data: Prepared,
+    effects: Sequence[type[Effect]] | None = None,
+    between: Float[np.ndarray, " m"] | None = None,
 ) -> CandidateModel:
     """Add every effect that the plant does not have yet, at every joint and spring that accepts it.
 
@@ -69,13 +81,14 @@ def build_candidate_model(
         machine: The baseline.
         data: The log to be searched, for scales.
         effects: Effects to add; default all except those on request.
+        between: See `scales_of`.
 
     Raises:
         InputError: If a user-defined effect cannot be searched for.
     """
     if effects is None:
         effects = [cls for cls in EFFECTS.values() if not cls.on_request]
-    scales = scales_of(machine.plant, data)
+    scales = scales_of(machine.plant, data, between)
     plant, parameters = machine.plant, machine.parameters
     base = np.arange(len(parameters.free))
     candidates = []

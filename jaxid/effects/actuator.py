@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from jaxid.arrays import Array
 from jaxid.effects.registry import register
 from jaxid.model.effect import Action, Effect, Scales, Signals
@@ -171,15 +173,19 @@ class Saturation(Effect):
 
     @classmethod
     def neutral(cls, scales: Scales) -> dict[str, float]:
-        return {"limit": 10 * scales.peak_force}
+        return {"limit": 10 * scales.largest_force}
 
     @classmethod
     def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
-        return {"limit": (0.0, 20 * scales.peak_force)}
+        return {"limit": (0.0, 20 * scales.largest_force)}
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
-        return [{"limit": scales.peak_force * s} for s in (0.97, 0.9, 0.8, 0.65, 0.5, 0.35)]
+        limits = [scales.peak_force * s for s in (0.97, 0.9, 0.8, 0.65, 0.5, 0.35)]
+        if scales.largest_force > scales.peak_force:
+            # A change of the command between two rows of the log is answered by a short, large force.
+            limits += [*np.geomspace(1.2 * scales.peak_force, 0.97 * scales.largest_force, 5)]
+        return [{"limit": float(limit)} for limit in limits]
 
 
 @register("voltage_limit")
@@ -218,12 +224,12 @@ class VoltageLimit(Effect):
 
     @classmethod
     def neutral(cls, scales: Scales) -> dict[str, float]:
-        return {"stall": 10 * scales.peak_force, "velocity": 4 * scales.peak_velocity}
+        return {"stall": 10 * scales.largest_force, "velocity": 4 * scales.peak_velocity}
 
     @classmethod
     def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
         # A limit that hardly falls over the log's speeds is a saturation.
-        return {"stall": (0.0, 20 * scales.peak_force), "velocity": (0.0, 5 * scales.peak_velocity)}
+        return {"stall": (0.0, 20 * scales.largest_force), "velocity": (0.0, 5 * scales.peak_velocity)}
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:

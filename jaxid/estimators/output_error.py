@@ -48,6 +48,7 @@ from jaxid.numerics.lanes import SolveRequest, Steps, run_alone, solved_together
 from jaxid.numerics.misspecified import std_under_misspecification
 from jaxid.numerics.precision import Precision, Rows, assess_together, full_hessian, hessian_notes
 from jaxid.simulation.kalman import rounded_readings
+from jaxid.simulation.noisy_loop import ReadingNoise
 from jaxid.simulation.replay import (
     Numerics,
     Replay,
@@ -179,6 +180,7 @@ class _Output:
         stays: Whether the start is that of the log, or rest, and never an unknown.
         width: Number of changes of the start that are unknowns or zero.
         start: Whether they are unknowns.
+        noise: Noise of the encoder in the loop; None: the loop is simulated without noise.
     """
 
     part: Part
@@ -189,17 +191,22 @@ class _Output:
     stays: bool
     width: int
     start: bool = False
+    noise: ReadingNoise | None = None
 
     @classmethod
-    def of(cls, part: Part, numerics: Numerics, on: str, alone: bool) -> _Output:
+    def of(
+        cls, part: Part, numerics: Numerics, on: str, alone: bool, noise: ReadingNoise | None = None
+    ) -> _Output:
         """Return the output of a log, alone or among others, whose simulation starts as the log does."""
         replay = make_replay(part.machine, part.log, numerics)
         replay = with_fitted_start(replay, part.machine.plant, part.log)
+        if noise is not None:
+            replay = noise.on(replay)
         looped = replay.controller is not None
         stays = bool(numerics.segment) or (looped and part.log.samples > SHORT)
         # Among others every start has columns: the noise by which a log counts leaves out what they explain.
         width = 0 if stays and alone else 2 * part.log.position.shape[1]
-        return cls(part, numerics, replay, *_measured(part, on), stays, width)
+        return cls(part, numerics, replay, *_measured(part, on), stays, width, noise=noise)
 
     @property
     def looped(self) -> bool:
@@ -228,9 +235,9 @@ class _Output:
     def with_longer_delay(self) -> _Output:
         """Return the output with a simulation that keeps twice as many past commands."""
         numerics = replace(self.numerics, longest_delay=2 * self.numerics.longest_delay)
-        return replace(
-            self, numerics=numerics, replay=make_replay(self.part.machine, self.part.log, numerics)
-        )
+        replay = make_replay(self.part.machine, self.part.log, numerics)
+        replay = replay if self.noise is None else self.noise.on(replay)
+        return replace(self, numerics=numerics, replay=replay)
 
 
 def _measured(part: Part, on: str) -> tuple[np.ndarray, np.ndarray]:
@@ -460,6 +467,7 @@ def output_error_steps(
     profile: Sequence[str] = (),
     on: str = "position",
     minimiser: str | Minimiser | None = None,
+    noise: ReadingNoise | None = None,
 ) -> Steps[Estimate]:
     """Run `output_error` as a generator of solve requests.
 
@@ -468,6 +476,8 @@ def output_error_steps(
         log: The log, or the parts of several.
         start, numerics, hessian, profile, on, minimiser: See `output_error`.
         solver: One of `jaxid.names.SOLVERS` for the chosen settings of the integration; None: fixed steps.
+        noise: Noise of the encoder that the loop of a log alone is simulated with, whose mean readings are
+            then compared; None: it is simulated without noise.
 
     Raises:
         InputError: Those of `output_error`; or a profile or a minimiser is asked for with several logs.
@@ -488,7 +498,7 @@ def output_error_steps(
         parts = [replace(part, machine=part.at(start)) for part in parts]
 
     first = "position" if on == "both" else on
-    fit = _Fit(machine, _outputs(parts, numerics, solver, first), first, minimiser)
+    fit = _Fit(machine, _outputs(parts, numerics, solver, first, noise), first, minimiser)
     theta = machine.parameters.guess
     if machine.unknown_reference is not None:
         # With a wrong reference the machine's parameters would diverge: fit the reference's unknowns first.
@@ -507,13 +517,18 @@ def output_error_steps(
 
 
 def _outputs(
-    parts: Sequence[Part], numerics: Numerics | None, solver: str | None, on: str
+    parts: Sequence[Part],
+    numerics: Numerics | None,
+    solver: str | None,
+    on: str,
+    noise: ReadingNoise | None,
 ) -> tuple[_Output, ...]:
     """Return the outputs of all logs; one number of steps serves them, so that they share compiled code."""
     chosen = [numerics or choose_numerics(part.machine, part.log, solver=solver) for part in parts]
     most, alone = max(n.substeps for n in chosen), len(parts) == 1
     return tuple(
-        _Output.of(part, replace(n, substeps=most), on, alone) for part, n in zip(parts, chosen, strict=True)
+        _Output.of(part, replace(n, substeps=most), on, alone, noise)
+        for part, n in zip(parts, chosen, strict=True)
     )
 
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxid.consistency.absent import without_scale
 from jaxid.controllers.linear import PD, PID, CascadePD
@@ -25,7 +26,8 @@ from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER, Parameters
 from jaxid.numerics.lanes import Steps
 from jaxid.numerics.precision import Precision, assess
-from jaxid.simulation.replay import Numerics
+from jaxid.simulation.noisy_loop import ReadingNoise, estimated_noise
+from jaxid.simulation.replay import Numerics, make_replay
 from jaxid.simulation.sensor_noise import position_noise
 
 if TYPE_CHECKING:
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
 
 # Starts from which logs that are fitted together are fitted; each fit simulates all of them many times.
 _STARTS_TOGETHER = 2
+# Number of times that the noise of the encoder is estimated, and the unknowns refitted.
+_RENEWALS = 2
 # Keys of each law that give its command a scale; without one that is known, the scale is free.
 _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
 
@@ -59,6 +63,9 @@ def unforced_steps(session: Session, *, numerics: Numerics | None = None, **opti
     for start in starts:
         fits.append((yield from output_error_steps(fitted, parts, start=start, numerics=numerics, **options)))
     result = min(fits, key=lambda e: (not e.converged, _cost(e)))
+    if len(parts) == 1 and result.converged:
+        noisy = yield from fitted_with_noise(fitted, parts[0].log, result.theta, numerics=numerics, **options)
+        result = noisy or result
     return result if base is None else with_free_scale(result, machine, group, base)
 
 
@@ -196,6 +203,43 @@ def free_precision(old: Precision, machine: Machine, group: tuple[int, ...], bas
         old.curvature,
         None if white is None else np.insert(white, base, np.nan),
     )
+
+
+def fitted_with_noise(
+    machine: Machine, log: Log, start: Float[np.ndarray, " p"], **options: Any
+) -> Steps[Estimate | None]:
+    """Fit the mean readings of a loop whose controller reads a noisy encoder.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        start: Values of the unknowns near the optimum, at which the noise is estimated first.
+        options: Further arguments of `output_error_steps`.
+
+    Returns:
+        The estimate; None if nothing is known of the noise, or the fit does not converge.
+    """
+    best: Estimate | None = None
+    if options.get("on", "position") != "position":
+        return None
+    for _ in range(_RENEWALS):
+        at = machine.with_estimate(start if best is None else best.theta)
+        numerics = options.get("numerics") or choose_numerics(at, log)
+        noise = estimated_noise(at, log, make_replay(at, log, numerics))
+        if noise is None:
+            return best
+        new = yield from output_error_steps(machine, log, start=at.parameters.guess, noise=noise, **options)
+        if not new.converged:
+            return best
+        best = replace(new, notes=(*new.notes, _words(noise)))
+    return best
+
+
+def _words(noise: ReadingNoise) -> str:
+    """Return the note on the noise with which a loop was simulated."""
+    std = ", ".join(f"{s:.2g}" for s in noise.std)
+    counts = " and rounding to counts" if np.any(noise.count > 0) else ""
+    return f"the loop reads its encoder with noise of {std} (standard deviation){counts}: the mean is fitted"
 
 
 def precision_at_guesses(machine: Machine, log: Log) -> Precision:

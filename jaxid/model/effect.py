@@ -79,6 +79,8 @@ class Scales:
         peak_velocity, peak_force: Largest absolute values.
         period: Sampling time [s].
         duration: Length of the log [s].
+        between: Largest absolute force between the rows of a log that is slower than its loop; zero if it is
+            not known.
     """
 
     position: float
@@ -89,6 +91,12 @@ class Scales:
     peak_force: float
     period: float
     duration: float
+    between: float = 0.0
+
+    @property
+    def largest_force(self) -> float:
+        """Largest absolute force, at the rows of the log or between them."""
+        return max(self.peak_force, self.between)
 
     def natural(self, dimension: str) -> float:
         """Return the size at which a parameter of this dimension would explain all of the force."""

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.stats import norm
 
 from jaxid.arrays import Array, library
 from jaxid.sensors.inertial import InertialSensors
@@ -15,6 +16,9 @@ from jaxid.sensors.inertial import InertialSensors
 # Noise of this many counts makes the rounding error independent of the signal
 # (Schuchman 1964; Gaussian noise, to 1 %).
 _DITHERS = 0.5
+# Neighbouring counts on each side that a reading may take with less noise than that, and the noise in counts
+# that stands for none.
+_LEVELS, _NOISELESS = 3, 1e-6
 
 
 class Sensor(eqx.Module):
@@ -48,6 +52,22 @@ class Sensor(eqx.Module):
             return q
         counts = jnp.round(q / self.position_resolution) * self.position_resolution
         return q + jax.lax.stop_gradient(counts - q)
+
+    def expected(self, q: Array) -> Array:
+        """Return the mean of all readings of a position, (..., n), with a straight-through gradient."""
+        if self.position_resolution is None:
+            return q
+        count = jnp.asarray(self.position_resolution)
+        noise = jnp.zeros(()) if self.position_noise is None else jnp.asarray(self.position_noise)
+        parts = jnp.broadcast_to(noise / count, q.shape[-1:])[:, None]
+        off = (q / count - jnp.round(q / count))[..., None]
+        edges = jnp.arange(_LEVELS) + 0.5
+
+        # A reading exceeds the nearest count by one for each edge above that the noise crosses.
+        crossed = [norm.cdf((sign * off - edges) / (parts + _NOISELESS)) for sign in (1.0, -1.0)]
+        rounded = count * (jnp.round(q / count) + jnp.sum(crossed[0] - crossed[1], axis=-1))
+        mean = jnp.where(noise < _DITHERS * count, rounded, q)
+        return q + jax.lax.stop_gradient(mean - q)
 
     def read_command(self, u: Array, noise: Array | None = None) -> Array:
         """Return the reading of a command, in its units."""

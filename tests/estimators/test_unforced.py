@@ -74,6 +74,7 @@ def test_a_known_gain_gives_all_values_from_guesses_four_times_off():
         assert found.std < 0.05 * true, name
 
 
+@pytest.mark.slow
 def test_guesses_five_times_off_lead_to_the_same_optimum():
     """From these guesses alone a fit ends elsewhere."""
     far = CASE
@@ -113,6 +114,7 @@ def test_without_anything_known_the_ratios_stand_and_no_absolute_value(tmp_path)
     assert "may all be multiplied by one factor" in " ".join(content["notes"])
 
 
+@pytest.mark.slow
 def test_a_missing_ripple_makes_the_model_incomplete():
     ripple = {"cogging": {"amplitude": 0.02, "period": 2 * np.pi / 12, "phase": 0.3}}
     result = identify(CASE, log(**ripple))

@@ -18,14 +18,16 @@ from jaxid.arrays import Array
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.acceptance import Acceptance
 from jaxid.discovery.domain import Domain
+from jaxid.discovery.final import machine_with
 from jaxid.discovery.in_loop.candidates import loop_columns
-from jaxid.discovery.search import Search
+from jaxid.discovery.search import Model, Search
 from jaxid.estimators.simulated_output import output_residual
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import in_threads
+from jaxid.simulation.noisy_loop import ReadingNoise, drawn_readings, estimated_noise
 from jaxid.simulation.replay import Numerics, Replay, make_replay
 from jaxid.simulation.step_size import fastest_rate
 
@@ -34,6 +36,8 @@ _COLUMNS = 4
 # Least steps of integration a tick with effects that put inertia behind a spring, and the largest product of
 # a step and the spring's frequency [rad] that is followed.
 _SPRUNG, _TURN = 4, 0.25
+# Number of times that noise and starts are estimated, and the unknowns refitted.
+_RENEWALS = 2
 # Part of the motion that integration leaves wrong in any model.
 _NUMERICS = 1e-5
 
@@ -43,18 +47,27 @@ class LoopSamples:
     """A log whose loop is simulated; see `jaxid.discovery.domain.Samples`.
 
     Args:
-        calm, sprung: The simulation without effects that add a spring, and with them.
-        measured: Measured position, (time, n).
+        log: The log.
+        quiet: The simulation without noise: without effects that add a spring, and with them.
+        calm, sprung: The same, shifted to the mean readings of a loop with noise, if that is known.
         moving: Mask of the samples that count: all of joints with an encoder.
         weight: The same as numbers.
+        noise: The noise of the encoder; None before it is estimated.
     """
 
+    log: Log
+    quiet: tuple[Replay, Replay]
     calm: Replay
     sprung: Replay
-    measured: Float[np.ndarray, "time n"]
     moving: Bool[np.ndarray, "time n"]
     weight: Float[np.ndarray, "time n"]
+    noise: ReadingNoise | None = None
     noisier: list[Any] = field(default_factory=list)
+
+    @property
+    def measured(self) -> Float[np.ndarray, "time n"]:
+        """Measured position, (time, n)."""
+        return self.log.filled
 
     @classmethod
     def of(cls, machine: Machine, log: Log, numerics: Numerics) -> LoopSamples:
@@ -68,7 +81,14 @@ class LoopSamples:
         moving = np.tile(np.array(log.measured), (log.samples, 1))
         finer = replace(numerics, substeps=max(_SPRUNG, numerics.substeps))
         calm, sprung = (make_replay(machine, log, n) for n in (numerics, finer))
-        return cls(calm, sprung, log.filled, moving, moving.astype(float))
+        return cls(log, (calm, sprung), calm, sprung, moving, moving.astype(float))
+
+    def with_noise(self, noise: ReadingNoise | None) -> LoopSamples:
+        """Return the samples whose loops are shifted to the mean readings with a noise of the encoder."""
+        if noise is None:
+            return self
+        calm, sprung = (noise.on(replay) for replay in self.quiet)
+        return replace(self, calm=calm, sprung=sprung, noise=noise)
 
 
 @dataclass(frozen=True)
@@ -213,11 +233,45 @@ class LoopAcceptance(Acceptance):
 
 @dataclass
 class LoopSearch(Search):
-    """A search whose models are compared with positions; arguments are those of `LoopAcceptance`."""
+    """A search whose models are compared with positions.
+
+    Args:
+        positions, logs: Those of `LoopAcceptance`.
+        machine: The fitted machine, without candidates. The noise in its loop takes hundreds of runs, which
+            the superset would make slow.
+    """
 
     positions: PositionDomain | None = None
     logs: tuple[LoopSamples, ...] = ()
+    machine: Machine | None = None
 
     def _acceptance(self) -> Acceptance:
         shared = (self.superset, self.data, self.validation, self.floor, self.colour)
         return LoopAcceptance(*shared, positions=self.positions, logs=self.logs)
+
+    def renewed(self, model: Model) -> Model:
+        """Return a model refitted with the noise of the encoder and the starts as they are beside it."""
+        for _ in range(_RENEWALS):
+            at = [(samples, *self._alone(samples, model)) for samples in self.logs]
+            noises = [estimated_noise(m, samples.log, replay, follows=False) for samples, m, replay in at]
+            self.logs = tuple(s.with_noise(noise) for s, noise in zip(self.logs, noises, strict=True))
+            self.samples, *others = self.logs
+            self.acceptance.samples, self.acceptance.others = self.samples, others
+            model = replace(model, theta=self.fit(model.theta, self.fitted_by(model.added)))
+        return model
+
+    def drawn_noise(self, model: Model, runs: int) -> Float[np.ndarray, "runs time n"] | None:
+        """Draw residuals of the fitted log by the noise in its loop."""
+        noise = self.samples.noise
+        if noise is None:
+            return None
+        machine, replay = self._alone(self.samples, model)
+        replay = replay.following(machine.parameters.places, machine.parameters.guess)
+        return drawn_readings(noise, replay, machine.plant, runs)
+
+    def _alone(self, samples: LoopSamples, model: Model) -> tuple[Machine, Replay]:
+        """Return the machine of a model without the other candidates, and its loop without noise."""
+        assert self.machine is not None, "given by the search"
+        machine, _ = machine_with(self.machine, self.superset, model.added, model.theta)
+        springs = any(cand.effect_of(self.superset, c).adds_spring for c in model.added)
+        return machine, samples.quiet[springs]

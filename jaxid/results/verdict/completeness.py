@@ -15,12 +15,15 @@ from jaxtyping import Float
 
 from jaxid.discovery.evidence import Whitener
 from jaxid.discovery.noise import NUMERICS, high_band_force_noise, sensor_colour
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.gap import ForceGap, SimulationGap, noise_density, row_noise
 from jaxid.logs.soundness import position_levels
 from jaxid.machine import Machine
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import OpenedLog
 from jaxid.simulation.force_balance import ForceData, inertial_force
+from jaxid.simulation.noisy_loop import mean_readings
+from jaxid.simulation.replay import make_replay
 from jaxid.simulation.sensor_noise import position_noise
 
 # Part of the half sampling rate of the kept samples that holds the band of the filter, see
@@ -163,8 +166,9 @@ def position_residuals(
 ) -> list[Residual]:
     """Compare the position that a simulated loop leaves of a log without a force with the encoder's noise.
 
-    Rounding to a count is white only while the joint moves by a good part of a count in a sample. Slower
-    samples do not count.
+    The mean readings of a loop that reads a noisy encoder count, since the noise moves them; see
+    `jaxid.simulation.noisy_loop`. Rounding to a count is white only while the joint moves by a good part of a
+    count in a sample. Slower samples do not count.
 
     Args:
         machine: The fitted machine.
@@ -181,10 +185,15 @@ def position_residuals(
         ]
 
     least = _EXCESS if fitted else _EXCESS_ELSEWHERE
+    simulated = gap.position
+    if machine.unforced(run.log):
+        numerics = choose_numerics(machine, run.log)
+        expected = mean_readings(machine, run.log, make_replay(machine, run.log, numerics))
+        simulated = gap.position if expected is None else expected
     out = []
     for k in joints:
-        rms = float(gap.rms[k])
-        e = (run.log.position - gap.position)[:, k]
+        e = (run.log.position - simulated)[:, k]
+        rms = float(np.sqrt(np.mean(e**2)))
         step = position_levels(run.log.position[:, k])[1]
         moving = np.abs(run.data.qd[:, k]) >= _ROUNDS_WHITE * step * run.log.rate_hz
         excess, count, power = cumulated_excess(e[moving] / max(float(floor[k]), 1e-300))
