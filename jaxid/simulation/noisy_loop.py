@@ -8,6 +8,7 @@ motion of a loop without noise, by an amount that follows the motion as a missin
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -117,7 +118,8 @@ class ReadingNoise:
         began = replace(
             began, position=began.position + self.nudge[:n], velocity=began.velocity + self.nudge[n:]
         )
-        values = {f.name: getattr(began, f.name) for f in fields(began)} | {"sensor": sensor}
+        values: dict[str, Any] = {f.name: getattr(began, f.name) for f in fields(began)}
+        values["sensor"] = sensor
         rows = -(-draws.shape[1] // replay.every)
         return NoisyReplay(**values, draws=draws, shift=np.broadcast_to(shift, (rows, n)).astype(float))
 
