@@ -32,7 +32,7 @@ def add(commands: Commands) -> None:
         "--check",
         metavar="LOG",
         help="replay a log by the file in MuJoCo: how far it is from jaxid's simulation, by joint, and "
-        "what each thing that the file lacks is worth",
+        "what each thing that the file lacks costs",
     )
     parser.add_argument(
         "--samples",

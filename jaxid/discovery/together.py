@@ -39,10 +39,7 @@ def add_together(search: Search, steps: list[Step], most: int) -> list[Step]:
     if len(laws) < 2:
         return steps
     search.progress("fitting friction, springs and rotors of all joints at once")
-    theta = search.baseline.copy()
-    for c in laws:
-        theta[c.index] = c.starts[0]
-    theta = search.fit(theta, search.fitted_by(laws))
+    theta = _fitted(search, laws).theta
     if not _closes(search, old, theta):
         return steps
 

@@ -88,7 +88,7 @@ class FewJoints(eqx.Module):
 
 
 def _nodes(turns: bool, degree: int) -> Float[np.ndarray, " k"]:
-    """Return coordinates of a joint that tell the coefficients of a polynomial."""
+    """Return coordinates of a joint at which values determine the coefficients of a polynomial."""
     count = 2 * degree + 1
     return 2 * np.pi * np.arange(count) / count if turns else np.arange(degree + 1) - 0.5 * degree
 

@@ -142,7 +142,7 @@ class LinkTree(WithLinks):
         return joints
 
     def frame(self, link: int, q: Array) -> tuple[Array, Array]:
-        axes, origins = self.geometry.frames(self._of_links(q))
+        axes, origins = self.geometry.frames(self.of_links(q))
         first, *rest = self.way(self.first_link(link))
         whole, origin = axes[first], origins[first]
         for k in rest:
@@ -173,7 +173,7 @@ class LinkTree(WithLinks):
     def _links_force(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Return the forces of the links by their recursion."""
         moments = self._moments() if self.moments is None else self.moments
-        motion = (self._of_links(x) for x in (q, qd, qdd))
+        motion = (self.of_links(x) for x in (q, qd, qdd))
         tau = inverse_dynamics(self.tree, self.geometry, -self.gravity_vector, moments, *motion)
         return jnp.sum(self._ratios().T * tau[None, :], axis=1) if self.copies else tau
 
@@ -184,7 +184,7 @@ class LinkTree(WithLinks):
             out[link, joint] = ratio
         return out
 
-    def _of_links(self, x: Float[Array, " n"]) -> Float[Array, " links"]:
+    def of_links(self, x: Float[Array, " n"]) -> Float[Array, " links"]:
         """Return the motion of each link's joint, from that of the free ones."""
         return jnp.sum(self._ratios() * x[None, :], axis=1) if self.copies else x
 

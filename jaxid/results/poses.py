@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -85,24 +87,16 @@ def places_of(plant: LinkTree, q: Float[np.ndarray, "time n"]) -> Float[np.ndarr
         plant: The arm; its masses place the ends of the last links, which have no further joint.
         q: Positions of its free joints [rad or m].
     """
-    frames, parents = plant.geometry.at_zero(), plant.tree.parents
-    axes, origins = np.asarray(frames.axes), np.asarray(frames.origins)
-    ratios = plant._ratios() if plant.copies else np.eye(len(parents))
-    of_links = q @ ratios.T
+    frames = jax.vmap(lambda now: plant.geometry.frames(plant.of_links(now)))
+    axes, origins = (np.asarray(x) for x in frames(jnp.asarray(q)))
 
     turned: list[np.ndarray] = []
     placed: list[np.ndarray] = []
-    for link, parent in enumerate(parents):
+    for link, parent in enumerate(plant.tree.parents):
         at = np.broadcast_to(np.eye(3), (len(q), 3, 3)) if parent < 0 else turned[parent]
         start = np.zeros((len(q), 3)) if parent < 0 else placed[parent]
-        here, by = at @ axes[link], of_links[:, link]
-        origin = start + at @ origins[link]
-        if frames.joints[link] == "revolute":
-            here = here @ _about_z(by)
-        else:
-            origin = origin + by[:, None] * here[:, :, 2]
-        turned.append(here)
-        placed.append(origin)
+        turned.append(at @ axes[:, link])
+        placed.append(start + np.einsum("tij,tj->ti", at, origins[:, link]))
     ends = [placed[k] + turned[k] @ _centre(plant, k) for k in _tips(plant)]
     return np.stack([np.zeros((len(q), 3)), *placed, *ends], axis=1)
 
@@ -117,12 +111,6 @@ def _centre(plant: LinkTree, link: int) -> Float[np.ndarray, " 3"]:
     moments = [float(np.asarray(getattr(plant, f"first_moment_{axis}"))[link]) for axis in "xyz"]
     mass = float(np.asarray(plant.mass)[link])
     return np.array(moments) / mass if mass > 0 else np.zeros(3)
-
-
-def _about_z(angle: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time 3 3"]:
-    c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
-    rows = [[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _up(plant: LinkTree) -> Float[np.ndarray, " 3"]:

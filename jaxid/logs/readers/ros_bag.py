@@ -30,7 +30,7 @@ JOINT_VECTORS = ("position", "velocity", "effort")
 _NAME = re.compile(r"(?P<topic>[^.]+)\.(?P<field>[^\[\]]+)(\[(?P<entry>.+)\])?$")
 # Messages whose bytes are read at once.
 _PART = 20_000
-# Offset between two clocks that is worth a word [s], and their drift.
+# Offset between two clocks that is reported [s], and their drift.
 _OFFSET, _DRIFT = 1e-3, 1e-5
 _NANO = 1e-9
 
