@@ -210,7 +210,6 @@ def _gaps(search: Search, start: Model, model: Model) -> tuple[LogGap, ...]:
     """Return the unexplained force of each log, with one model for all and with the differences."""
     out = []
     for log, before, after in zip(search.logs, search.residuals(start), search.residuals(model), strict=True):
-        time = np.concatenate([part.times for part in log.samples.parts])
         hidden = [np.where(log.counts, e, np.nan) for e in (before, after)]
-        out.append(LogGap(log.name, log.rms(before), log.rms(after), log.floor, time, *hidden))
+        out.append(LogGap(log.name, log.rms(before), log.rms(after), log.floor, log.times, *hidden))
     return tuple(out)

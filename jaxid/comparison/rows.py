@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,10 +12,13 @@ from jaxtyping import Bool, Float
 from jaxid.comparison.model import Model
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
+from jaxid.discovery.acceptance import absorbed_noise
+from jaxid.discovery.domain import Domain, ForceDomain
 from jaxid.discovery.noise import NUMERICS, sensor_colour
 from jaxid.gap import noise_floor
 from jaxid.machine import Machine
 from jaxid.numerics.precision import NoiseModel
+from jaxid.own_values import OwnValues
 from jaxid.session import OpenedLog
 
 # Stretches of each log between which estimates are compared.
@@ -28,24 +32,35 @@ class ComparedLog:
     Args:
         name: Its name.
         runs: The log, or its pieces.
-        samples: The samples that the comparison uses.
-        colour: Noise that the sensors cause in its balance, by joint.
+        domain: What a model is compared with: forces, or the positions of a simulated loop.
+        samples: The samples that the comparison uses, as the domain takes them.
+        view: The unknowns as this log has them.
+        colour: Noise that the sensors cause in its residual, by joint.
         floor: RMS of that noise, by joint.
         smallest: Residual below which nothing counts, by joint: noise and errors of numerics.
         numerics: Sum of squares that errors of filtering and integration may cause, in units of `smallest`.
+        independent: Part of its samples that is independent.
+        times: Time of the samples [s].
+        position, velocity: Motion at the samples.
     """
 
     name: str
     runs: tuple[OpenedLog, ...]
-    samples: cand.CandidateSamples
+    domain: Domain
+    samples: Any
+    view: cand.View
     colour: tuple[NoiseModel, ...]
     floor: Float[np.ndarray, " n"]
     smallest: Float[np.ndarray, " n"]
     numerics: float
+    independent: float
+    times: Float[np.ndarray, " kept"]
+    position: Float[np.ndarray, "kept n"]
+    velocity: Float[np.ndarray, "kept n"]
 
     @classmethod
     def of(cls, runs: Sequence[OpenedLog], machine: Machine, superset: cand.CandidateModel) -> ComparedLog:
-        """Open a log, of which there may be several pieces, for a comparison.
+        """Open a log, of which there may be several pieces, for a comparison of forces.
 
         Args:
             runs: The log, or its pieces.
@@ -55,44 +70,56 @@ class ComparedLog:
         first = runs[0]
         own = first.machine(machine)
         ones = np.ones(first.log.position.shape[1])
-        views = []
-        for run in runs:
-            assert run.own is not None, "each of several logs has values of its own, or none"
-            views.append(cand.View.of(superset.machine, run.own, ones))
+        views = [cand.View.of(superset.machine, own_values(run), ones) for run in runs]
         noise = own.sensor.force_noise
         noise = None if noise is None else np.asarray(noise) * own.gain
         more = [(run.data, view) for run, view in zip(runs[1:], views[1:], strict=True)]
         samples = cand.CandidateSamples(first.data, noise, views[0], more)
+
         floor = noise_floor(own, first.log, first.data)
         force = first.data.force - first.data.force.mean(axis=0)
         numerics = NUMERICS * float(np.sqrt(np.mean(force**2)))
         smallest = np.hypot(floor, numerics)
-        name = first.own.log if first.own is not None else first.name
-        colour = sensor_colour(own, first.log, first.data)
-        errors = float(np.sum(samples.moving.sum(axis=0) * (numerics / smallest) ** 2))
-        return cls(name, tuple(runs), samples, colour, floor, smallest, errors)
+        parts = samples.parts
+        return cls(
+            name=own_values(first).log,
+            runs=tuple(runs),
+            domain=ForceDomain(superset),
+            samples=samples,
+            view=views[0],
+            colour=sensor_colour(own, first.log, first.data),
+            floor=floor,
+            smallest=smallest,
+            numerics=float(np.sum(samples.moving.sum(axis=0) * (numerics / smallest) ** 2)),
+            independent=first.data.recipe.independent,
+            times=np.concatenate([p.times for p in parts]),
+            position=np.concatenate([p.at_kept(p.q) for p in parts]),
+            velocity=np.concatenate([p.at_kept(p.qd) for p in parts]),
+        )
 
     @property
     def counts(self) -> Bool[np.ndarray, "kept n"]:
         """Mask of the samples that count."""
         return self.samples.moving
 
-    @property
-    def independent(self) -> float:
-        """Part of its samples that is independent."""
-        return self.runs[0].data.recipe.independent
-
     def evaluate(
-        self, superset: cand.CandidateModel, theta: np.ndarray, wanted: Sequence[int] = ()
+        self, theta: np.ndarray, wanted: Sequence[int] = ()
     ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
         """Compute the residual of the superset at values that hold in this log, and its Jacobian.
 
         Args:
-            superset: The machine with all candidates.
             theta: All unknowns of the superset, (p,).
             wanted: Indices of the unknowns that need derivatives.
         """
-        return cand.evaluate(superset, self.samples, theta, list(wanted))
+        return self.domain.evaluate(self.samples, theta, list(wanted))
+
+    def points(self, rest: list[cand.Candidate], theta: np.ndarray, e: np.ndarray) -> list[cand.Point]:
+        """Linearise candidates at each of their starts, beside values that leave a residual."""
+        return self.domain.points(rest, self.samples, theta, e)
+
+    def absorbed(self, old: np.ndarray, new: np.ndarray) -> float:
+        """Return the part of the noise that new values of the drive filter out."""
+        return absorbed_noise(self.domain, self.samples, self.colour, old, new)
 
     def squares(self, e: Float[np.ndarray, "kept n"]) -> float:
         """Return the sum of squares of a residual in units of the noise."""
@@ -104,6 +131,20 @@ class ComparedLog:
         samples = self.counts.sum(axis=0)
         total = np.sum(np.where(self.counts, e, 0.0) ** 2, axis=0)
         return np.sqrt(total / np.where(samples > 0, samples, np.nan))
+
+    def within(self, other: ComparedLog) -> Bool[np.ndarray, "kept n"]:
+        """Return which samples lie within the range of position and velocity of another log."""
+        inside = np.ones(self.counts.shape, bool)
+        pairs = ((self.position, other.position), (self.velocity, other.velocity))
+        for here, others in pairs:
+            inside &= (here >= others.min(axis=0)) & (here <= others.max(axis=0))
+        return inside
+
+
+def own_values(run: OpenedLog) -> OwnValues:
+    """Return the values of its own that a log has; each log of several has some, or none."""
+    assert run.own is not None, "each of several logs has values of its own, or none"
+    return run.own
 
 
 class Whitened:

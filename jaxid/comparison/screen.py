@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,8 +22,6 @@ from jaxid.model.unknowns import Free
 _SURROGATES = 200
 # Ridge of a solution that only asks which columns are new, relative to their squares.
 _RIDGE = 1e-12
-
-Grid = Callable[[int, cand.Candidate], list[cand.Point]]
 
 
 @dataclass(frozen=True)
@@ -144,7 +142,8 @@ def screen_changes(
     logs: Sequence[ComparedLog],
     model: Model,
     comparable: Sequence[int],
-    grid: Grid | None,
+    *,
+    effects: bool = True,
 ) -> Screen:
     """Score every change of a model, and calibrate the threshold.
 
@@ -153,20 +152,18 @@ def screen_changes(
         logs: The logs.
         model: The model.
         comparable: Indices of the parameters that may differ between logs.
-        grid: Function that returns the points of a candidate with many starts in a log; None: only the
-            parameters are scored, and no effects.
+        effects: False to score the parameters only.
     """
-    changes = [] if grid is None else effect_changes(superset.candidates, model, len(logs))
+    changes = effect_changes(superset.candidates, model, len(logs)) if effects else []
     rest = [c for c in superset.candidates if any(x.effect is c for x in changes)]
     whiteners, residuals, bases, points = [], [], [], []
     rng = np.random.default_rng(20240501)
     for k, log in enumerate(logs):
         fitted = model.fitted_in(k)
-        e, jacobian = log.evaluate(superset, model.theta[k], fitted)
+        e, jacobian = log.evaluate(model.theta[k], fitted)
         own, extra = [], np.zeros((*e.shape, 0))
-        if grid is not None:
-            own = cand.points(superset, rest, log.samples, model.theta[k], e)
-            own += [p for c in rest if c.has_grid for p in grid(k, c)]
+        if effects:
+            own = log.points(rest, model.theta[k], e)
             scale = np.array([c.innovation for c in log.colour])
             own = [p for p in own if has_influence(p, log.counts, scale)]
             extra = all_columns(e, jacobian[..., fitted], own, log.counts, scale)

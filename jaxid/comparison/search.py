@@ -15,9 +15,8 @@ from jaxid.comparison.rows import STRETCHES, ComparedLog, Whitened
 from jaxid.comparison.screen import Scored, Screen, screen_changes
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
-from jaxid.discovery.acceptance import RELEVANT, absorbed_noise
+from jaxid.discovery.acceptance import RELEVANT
 from jaxid.discovery.bounded_fit import bounded_fit
-from jaxid.discovery.domain import ForceDomain
 from jaxid.discovery.selection import MODEST, TIE_NATS, TIE_PART
 
 # Number of best changes that are refitted. Those below this part of the best one follow only if none of the
@@ -124,13 +123,11 @@ class Search:
     logs: tuple[ComparedLog, ...]
     comparable: tuple[int, ...]
     progress: Callable[[str], None] = lambda text: None
-    _grid_points: dict[tuple[int, int], list[cand.Point]] = field(default_factory=dict)
     _rounds: dict[frozenset, Round] = field(default_factory=dict)
 
     def start(self, theta: Float[np.ndarray, " p"]) -> Model:
         """Return the model with one set of values for all logs, fitted from some values."""
-        views = [log.samples.arrays[0].view for log in self.logs]
-        by_log = [theta.copy() if view is None else view.theta(theta) for view in views]
+        by_log = [log.view.theta(theta) for log in self.logs]
         for values in by_log:
             for c in self.superset.candidates:
                 values[c.index] = c.neutral
@@ -250,12 +247,7 @@ class Search:
         after = self._after(new, screen.whitened)
         if change.effect is not None and not change.effect.amplitude.any():
             rows = [len(b) for b in screen.whitened.blocks]
-            absorbed = [
-                absorbed_noise(
-                    ForceDomain(self.superset), log.samples, log.colour, model.theta[k], new.theta[k]
-                )
-                for k, log in enumerate(self.logs)
-            ]
+            absorbed = [log.absorbed(model.theta[k], new.theta[k]) for k, log in enumerate(self.logs)]
             after /= 1 - float(np.average(absorbed, weights=rows))
         evidence = screen.gained(after)
         return Refit(change, new, evidence, self.objection(model, new, change))
@@ -322,7 +314,7 @@ class Search:
 
     def residuals(self, model: Model) -> list[Float[np.ndarray, "kept n"]]:
         """Return the force residual of a model on each log."""
-        return [log.evaluate(self.superset, model.theta[k])[0] for k, log in enumerate(self.logs)]
+        return [log.evaluate(model.theta[k])[0] for k, log in enumerate(self.logs)]
 
     def squares(self, model: Model) -> float:
         """Return the sum of squares of all residuals, in units of the noise."""
@@ -363,7 +355,9 @@ class Search:
         of time, which an incomplete model makes larger.
         """
         if whitened is None:
-            whitened = screen_changes(self.superset, self.logs, model, self.comparable, None).whitened
+            whitened = screen_changes(
+                self.superset, self.logs, model, self.comparable, effects=False
+            ).whitened
         model = self.fit(model, whitened)
         columns, e = self._white(model, whitened)
         _, apart, covariance = whitened.left_out(columns, e)
@@ -390,7 +384,7 @@ class Search:
         loud = [k for k in range(len(self.logs)) if k not in quiet]
         for k, other in itertools.product(loud, quiet):
             log, calm = self.logs[k], self.logs[other]
-            counts = log.counts & _within(log, calm)
+            counts = log.counts & log.within(calm)
             total = float(np.sum(np.where(counts, residuals[k] / log.smallest, 0.0) ** 2))
             ratio = np.sqrt(total / max(counts.sum(), 1))
             if ratio > _ABOVE_FLOOR:
@@ -409,23 +403,15 @@ class Search:
         """Score the changes of a model; if its residual is noise, effects only if a parameter differs."""
         self.progress("screening changes")
         if self.at_floor(model):
-            screen = screen_changes(self.superset, self.logs, model, self.comparable, None)
+            screen = screen_changes(self.superset, self.logs, model, self.comparable, effects=False)
             if all(s.evidence < screen.threshold for s in screen.scores):
                 return screen
-        return screen_changes(self.superset, self.logs, model, self.comparable, self._grid)
+        return screen_changes(self.superset, self.logs, model, self.comparable)
 
     @staticmethod
     def _equal(one: Refit, best: Refit) -> bool:
         """Check that a change explains the logs as well as the best one."""
         return one.evidence >= best.evidence - max(_CHANCE, TIE_PART * best.evidence)
-
-    def _grid(self, log: int, candidate: cand.Candidate) -> list[cand.Point]:
-        """Linearise a candidate at its many starts; the result is kept, since no other effect enters it."""
-        key = (log, id(candidate))
-        if key not in self._grid_points:
-            samples = self.logs[log].samples
-            self._grid_points[key] = cand.grid_points(self.superset, candidate, samples)
-        return self._grid_points[key]
 
     def _after(self, model: Model, whitened: Whitened) -> float:
         """Return the held-out sum of squares of a model, linearised at its values."""
@@ -434,9 +420,7 @@ class Search:
 
     def _white(self, model: Model, whitened: Whitened) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return columns and residual of a model as rows of unit noise, by log."""
-        both = [
-            log.evaluate(self.superset, model.theta[k], model.fitted_in(k)) for k, log in enumerate(self.logs)
-        ]
+        both = [log.evaluate(model.theta[k], model.fitted_in(k)) for k, log in enumerate(self.logs)]
         return whitened.base(model, [j for _, j in both]), whitened.residual([e for e, _ in both])
 
     def _rows(self, model: Model, whitened: Whitened | None) -> tuple[np.ndarray, np.ndarray]:
@@ -447,7 +431,7 @@ class Search:
         residuals, jacobians = [], []
         unknowns = model.unknowns
         for k, log in enumerate(self.logs):
-            e, jacobian = log.evaluate(self.superset, model.theta[k], model.fitted_in(k))
+            e, jacobian = log.evaluate(model.theta[k], model.fitted_in(k))
             shown = [j for j, u in enumerate(unknowns) if k in u.logs]
             columns = np.zeros((*e.shape, len(unknowns)))
             columns[..., shown] = jacobian[..., [unknowns[j].index for j in shown]]
@@ -512,19 +496,3 @@ def _contrasts(model: Model, change: Change) -> list[tuple[np.ndarray, float]]:
         base = np.array([float(u.index == change.index and u.logs == rest[0]) for u in unknowns])
         out.append((mine - base, 0.0))
     return out
-
-
-def _within(log: ComparedLog, other: ComparedLog) -> np.ndarray:
-    """Return which samples of a log lie within the range of position and velocity of another."""
-
-    def motion(one: ComparedLog) -> tuple[np.ndarray, np.ndarray]:
-        parts = one.samples.parts
-        position = np.concatenate([p.at_kept(p.q) for p in parts])
-        velocity = np.concatenate([p.at_kept(p.qd) for p in parts])
-        return position, velocity
-
-    inside = np.ones(log.counts.shape, bool)
-    for here, others in zip(motion(log), motion(other), strict=True):
-        low, high = others.min(axis=0), others.max(axis=0)
-        inside &= (here >= low) & (here <= high)
-    return inside
