@@ -187,13 +187,7 @@ def servo(seed: int, hidden: str | None = None) -> Servo:
         "coulomb_friction": {"level": inertia * rng.uniform(5.0, 25.0)},
         "command_delay": {"delay": np.ceil(rng.uniform(0.0, 0.06) * rate) / rate},
     }
-    t = np.arange(round(SECONDS * rate / every)) * every / rate
-    count = int(rng.integers(4, 8))
-    waypoints = np.concatenate([[0.0], rng.uniform(-1.2, 1.2, count)])
-    command = moves(
-        t, waypoints, rng.uniform(1.0, 5.0, count + 1), rng.uniform(20.0, 60.0), rng.uniform(0.05, 0.3)
-    )
-    command = command + multisine(t, rng.uniform(0.3, 3.5, 3), rng.uniform(0.05, 0.2), seed)
+    command = command_of(rng, rate, every, seed)
     made = Servo(
         seed=seed,
         rate=rate,
@@ -209,6 +203,24 @@ def servo(seed: int, hidden: str | None = None) -> Servo:
     if hidden is None or hidden in ("viscous_friction", "coulomb_friction"):
         return made
     return dataclasses.replace(made, effects={**effects, hidden: _values(hidden, made, rng)})
+
+
+def command_of(rng: np.random.Generator, rate: float, every: int, seed: int) -> np.ndarray:
+    """Draw a command, a value a row of the log [rad].
+
+    Args:
+        rng: Generator of its moves.
+        rate: Ticks of the loop [Hz].
+        every: Ticks a row.
+        seed: Seed of the phases of its sines.
+    """
+    t = np.arange(round(SECONDS * rate / every)) * every / rate
+    count = int(rng.integers(4, 8))
+    waypoints = np.concatenate([[0.0], rng.uniform(-1.2, 1.2, count)])
+    command = moves(
+        t, waypoints, rng.uniform(1.0, 5.0, count + 1), rng.uniform(20.0, 60.0), rng.uniform(0.05, 0.3)
+    )
+    return command + multisine(t, rng.uniform(0.3, 3.5, 3), rng.uniform(0.05, 0.2), seed)
 
 
 def _values(kind: str, made: Servo, rng: np.random.Generator) -> dict[str, float]:

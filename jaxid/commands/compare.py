@@ -10,16 +10,19 @@ import numpy as np
 
 from jaxid.case.case import CaseLike
 from jaxid.case.user_faults import named_faults
+from jaxid.comparison.loops import LoopLog
 from jaxid.comparison.model import Change, Model
 from jaxid.comparison.result import Comparison, Difference, LogGap, Rival, Value
 from jaxid.comparison.rows import ComparedLog
 from jaxid.comparison.search import Named, Search
 from jaxid.consistency.absent import acts_by_position
+from jaxid.discovery.in_loop.unforced import largest_force, loop_machine, searched, with_command
 from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.errors import InputError
-from jaxid.estimators import need_force, need_known_controller, need_known_reference
+from jaxid.estimators import need_alike, need_known_controller, need_known_reference, steps_of
 from jaxid.estimators.several.force import inverse_dynamics_steps
 from jaxid.estimators.several.parts import parts_of
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.logs.in_memory import LogLike
 from jaxid.machine import Machine
 from jaxid.model.unknowns import Free
@@ -46,7 +49,7 @@ def compare(
         progress: Function called with a line of text at every stage.
 
     Raises:
-        InputError: If case or logs are unsound, there are fewer than two logs, or one has no force.
+        InputError: If case or logs are unsound, there are fewer than two logs, or only some have a force.
     """
     if max_changes < 1:
         raise InputError(f"max_changes is {max_changes}", hint="give one or more")
@@ -66,7 +69,8 @@ def compare_session(
         max_changes, progress: Settings of `compare`.
 
     Raises:
-        InputError: If there are fewer than two logs, one has no force, or the loop has unknowns.
+        InputError: If there are fewer than two logs, only some have a force, or the loop of logs with a force
+            has unknowns.
     """
     if session.fit.log.steady is not None:
         hint = "fit each table by identify, and compare the values"
@@ -76,20 +80,43 @@ def compare_session(
         hint = "name two logs or more: jaxid compare CASE.toml LOG LOG"
         raise InputError("compare takes two logs or more, not one", where=session.case.where, hint=hint)
     need_known_reference(session, "an error of it would be taken for a difference")
-    need_force(session, "a comparison")
-    need_known_controller(session, "a comparison in forces does not simulate the loop")
+    need_alike(session)
 
     progress("fitting one machine to all logs")
-    machine = fitted_machine(session)
-    superset = build_candidate_model(machine, session.fit.data, _searched(session))
-    logs = tuple(ComparedLog.of(runs, machine, superset) for runs in groups)
-    search = Search(superset, logs, _comparable(session, superset.base), progress)
+    unforced = session.machine.unforced(session.fit.log)
+    search = _search_in_loops(session, groups) if unforced else _search_in_forces(session, groups)
+    search.progress = progress
 
-    start = search.start(superset.neutral)
+    start = search.start(search.superset.neutral)
     model, named = search.run(start, max_changes)
     why = "" if named else search.differ_unexplained(model)
     verdict = "differs" if named else "unexplained" if why else "same"
     return _result(session, search, start, model, named, verdict, why)
+
+
+def _search_in_forces(session: Session, groups: Sequence[Sequence[OpenedLog]]) -> Search:
+    """Return the search for differences between the forces of logs."""
+    need_known_controller(session, "a comparison in forces does not simulate the loop")
+    machine = fitted_machine(session)
+    superset = build_candidate_model(machine, session.fit.data, _searched(session))
+    logs = tuple(ComparedLog.of(runs, machine, superset) for runs in groups)
+    return Search(superset, logs, _comparable(session, superset.base))
+
+
+def _search_in_loops(session: Session, groups: Sequence[Sequence[OpenedLog]]) -> Search:
+    """Return the search for differences between the positions of loops without a force.
+
+    Raises:
+        InputError: If a loop cannot be simulated.
+    """
+    machine, base = loop_machine(run_alone(steps_of("output_error", session)))
+    data = with_command(session, machine)
+    first = session.fit.machine(machine)
+    between = largest_force(first, session.fit.log, choose_numerics(first, session.fit.log))
+    superset = build_candidate_model(machine, data, searched(session, machine), between)
+    logs = tuple(LoopLog.of(runs, machine, superset) for runs in groups)
+    held = () if base is None else (base,)
+    return Search(superset, logs, _comparable(session, superset.base), held=held)
 
 
 def fitted_machine(session: Session) -> Machine:
@@ -147,7 +174,9 @@ def _result(
     free, names = search.superset.machine.parameters.free, [log.name for log in search.logs]
 
     def value(index: int, log: int) -> Value:
-        unknown = next(u for u in estimates if u.index == index and log in u.logs)
+        unknown = next((u for u in estimates if u.index == index and log in u.logs), None)
+        if unknown is None:
+            return Value(float(final.theta[log, index]), np.nan, free[index].unit)
         return Value(float(estimates[unknown][0]), float(estimates[unknown][1]), free[index].unit)
 
     differences = []
@@ -183,6 +212,8 @@ def _result(
         tried=screen.changes,
         threshold=screen.threshold,
         parameters=shared,
+        quantity="position" if session.machine.unforced(session.fit.log) else "force",
+        scale=free[search.held[0]].name if search.held else "",
     )
 
 

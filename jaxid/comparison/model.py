@@ -75,11 +75,14 @@ class Model:
         theta: Unknowns of the superset as they hold in each log, (logs, p).
         base: Indices of the unknowns of the case.
         changes: Changes beside one set of values for all logs, in the order in which they were made.
+        held: Indices of unknowns of the case that keep their value in the first log, where nothing known
+            gives the logs a scale; they may differ in the others.
     """
 
     theta: Float[np.ndarray, "logs p"]
     base: tuple[int, ...]
     changes: tuple[Change, ...] = ()
+    held: tuple[int, ...] = ()
 
     @property
     def effects(self) -> tuple[Change, ...]:
@@ -95,10 +98,16 @@ class Model:
     def unknowns(self) -> list[Unknown]:
         """All fitted numbers: those of the case, then those of the effects."""
         out = [Unknown(i, logs) for i in self.base for logs in self.partition(i)]
+        out += [Unknown(i, logs) for i in self.held for logs in self.partition(i) if 0 not in logs]
         for c in self.effects:
             assert c.effect is not None, "an effect"
             out += [Unknown(int(i), c.logs) for i in c.effect.index]
         return out
+
+    @property
+    def fixed(self) -> list[Unknown]:
+        """Numbers that would be fitted if something gave the logs a scale."""
+        return [Unknown(i, logs) for i in self.held for logs in self.partition(i) if 0 in logs]
 
     def partition(self, index: int) -> Partition:
         """Return the sets of logs with one value of an unknown of the case."""
@@ -112,6 +121,10 @@ class Model:
     def fitted_in(self, log: int) -> list[int]:
         """Return the indices of the unknowns that hold in a log."""
         return [u.index for u in self.unknowns if log in u.logs]
+
+    def effects_in(self, log: int) -> list[Candidate]:
+        """Return the added effects that act in a log."""
+        return [c.effect for c in self.effects if c.effect is not None and log in c.logs]
 
     def values(self) -> Float[np.ndarray, " u"]:
         """Return the values of all fitted numbers."""
@@ -144,7 +157,9 @@ class Model:
         out = replace(self, theta=theta, changes=tuple(c for c in self.changes if c is not change))
         if change.index is not None:
             for logs in out.partition(change.index):
-                out.theta[list(logs), change.index] = np.mean(theta[list(logs), change.index])
+                values = theta[list(logs), change.index]
+                keeps = 0 in logs and change.index in self.held
+                out.theta[list(logs), change.index] = values[0] if keeps else np.mean(values)
         return out
 
 

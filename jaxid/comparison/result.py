@@ -80,7 +80,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class LogGap:
-    """Force that one log's balance leaves unexplained, by joint.
+    """Force or position that one model leaves unexplained of a log, by joint.
 
     Args:
         name: Name of the log.
@@ -109,11 +109,14 @@ class Comparison:
         verdict: "same", "differs" or "unexplained".
         differences: The fewest changes that explain what differs.
         alike: Effects that the case lacks in all logs alike.
-        gaps: Unexplained force of each log.
+        gaps: Unexplained force or position of each log.
         why: Sentence on what differs if nothing known explains it; empty otherwise.
         tried: Number of changes that were compared with the model of one machine.
         threshold: Evidence that noise alone exceeds once in a thousand comparisons [nats].
         parameters: Values of the unknowns that all logs share, by their names.
+        quantity: What was compared: "force", or "position" of the simulated loop for logs without a force.
+        scale: Name of the unknown that was held at its guess in the first log, because nothing known gives
+            the logs a scale; empty if something does.
     """
 
     session: Session
@@ -125,6 +128,8 @@ class Comparison:
     tried: int
     threshold: float
     parameters: Mapping[str, Value]
+    quantity: str = "force"
+    scale: str = ""
 
     @property
     def logs(self) -> tuple[str, ...]:

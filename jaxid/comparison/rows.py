@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxid.comparison.model import Model
+from jaxid.comparison.model import Unknown
 from jaxid.discovery import candidates as cand
 from jaxid.discovery import evidence as ev
 from jaxid.discovery.acceptance import absorbed_noise
@@ -117,6 +117,26 @@ class ComparedLog:
         """Linearise candidates at each of their starts, beside values that leave a residual."""
         return self.domain.points(rest, self.samples, theta, e)
 
+    def renewed(self, theta: np.ndarray, effects: Sequence[cand.Candidate] = ()) -> ComparedLog:
+        """Return the log with what its residual depends on at some values; nothing for forces.
+
+        Args:
+            theta: All unknowns of the superset.
+            effects: Effects that act in this log.
+        """
+        return self
+
+    def drawn_noise(
+        self, theta: np.ndarray, effects: Sequence[cand.Candidate], runs: int
+    ) -> Float[np.ndarray, "runs kept n"] | None:
+        """Draw residuals by noise alone; None if only the residual itself shows the noise.
+
+        Args:
+            theta, effects: As in `renewed`.
+            runs: Number of draws.
+        """
+        return None
+
     def absorbed(self, old: np.ndarray, new: np.ndarray) -> float:
         """Return the part of the noise that new values of the drive filter out."""
         return absorbed_noise(self.domain, self.samples, self.colour, old, new)
@@ -166,15 +186,15 @@ class Whitened:
         """Number of rows of all logs."""
         return sum(len(b) for b in self.blocks)
 
-    def base(
-        self, model: Model, jacobians: Sequence[Float[np.ndarray, "kept n p"]]
+    def columns(
+        self, unknowns: Sequence[Unknown], jacobians: Sequence[Float[np.ndarray, "kept n p"]]
     ) -> list[Float[np.ndarray, "row u"]]:
-        """Return the columns of the fitted numbers of a model, by log."""
+        """Return the columns of some numbers of a model, by log."""
         out = []
         for k, (whitener, jacobian) in enumerate(zip(self.whiteners, jacobians, strict=True)):
-            own = [j for j, u in enumerate(model.unknowns) if k in u.logs]
-            rows = np.zeros((len(self.blocks[k]), len(model.unknowns)))
-            rows[:, own] = whitener(jacobian[..., [model.unknowns[j].index for j in own]])
+            own = [j for j, u in enumerate(unknowns) if k in u.logs]
+            rows = np.zeros((len(self.blocks[k]), len(unknowns)))
+            rows[:, own] = whitener(jacobian[..., [unknowns[j].index for j in own]])
             out.append(rows)
         return out
 

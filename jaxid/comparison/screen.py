@@ -47,7 +47,8 @@ class Screen:
         whitened: Map from residuals to rows of unit noise.
         before: Held-out sum of squares of the model.
         scores: All changes at their best starts, best first.
-        largest: Largest evidence of any change, for each surrogate.
+        largest: Largest evidence of any change, for each surrogate, (kinds, runs): the residual with other
+            signs, and noise that was drawn, where it can be.
         apart: Evidence of a set of parameters for each log, in place of one for all.
         apart_by_chance: The same for each surrogate.
     """
@@ -55,14 +56,23 @@ class Screen:
     whitened: Whitened
     before: float
     scores: tuple[Scored, ...]
-    largest: Float[np.ndarray, " runs"]
+    largest: Float[np.ndarray, "kinds runs"]
     apart: float
-    apart_by_chance: Float[np.ndarray, " runs"]
+    apart_by_chance: Float[np.ndarray, "kinds runs"]
 
     @property
     def threshold(self) -> float:
         """Evidence that noise alone exceeds once in a thousand comparisons; infinite if none was scored."""
-        return ev.threshold(self.largest) if np.all(np.isfinite(self.largest)) else np.inf
+        return largest_threshold(self.largest) if np.all(np.isfinite(self.largest)) else np.inf
+
+    @property
+    def apart_threshold(self) -> float:
+        """The same for a set of parameters for each log."""
+        return largest_threshold(self.apart_by_chance)
+
+    def false_alarm(self, evidence: float) -> float:
+        """Return the probability that noise alone reaches an evidence with any change."""
+        return max(ev.false_alarm(evidence, some) for some in self.largest)
 
     @property
     def changes(self) -> int:
@@ -72,6 +82,11 @@ class Screen:
     def gained(self, after: float) -> float:
         """Return the evidence of a model with a held-out sum of squares."""
         return float(ev.log_evidence(self.whitened.rows, np.array(self.before), np.array(after)))
+
+
+def largest_threshold(by_chance: Float[np.ndarray, "kinds runs"]) -> float:
+    """Return the largest of the thresholds that kinds of surrogates give."""
+    return max(ev.threshold(some) for some in by_chance)
 
 
 class _Sums(NamedTuple):
@@ -156,11 +171,12 @@ def screen_changes(
     """
     changes = effect_changes(superset.candidates, model, len(logs)) if effects else []
     rest = [c for c in superset.candidates if any(x.effect is c for x in changes)]
-    whiteners, residuals, bases, points = [], [], [], []
+    whiteners, residuals, bases, points, drawn = [], [], [], [], []
     rng = np.random.default_rng(20240501)
     for k, log in enumerate(logs):
         fitted = model.fitted_in(k)
-        e, jacobian = log.evaluate(model.theta[k], fitted)
+        fixed = [u.index for u in model.fixed if k in u.logs]
+        e, jacobian = log.evaluate(model.theta[k], [*fitted, *fixed])
         own, extra = [], np.zeros((*e.shape, 0))
         if effects:
             own = log.points(rest, model.theta[k], e)
@@ -168,14 +184,19 @@ def screen_changes(
             own = [p for p in own if has_influence(p, log.counts, scale)]
             extra = all_columns(e, jacobian[..., fitted], own, log.counts, scale)
         whitener, noise = fit_whitener(e, jacobian[..., fitted], extra, log.counts, log.colour)
-        surrogates = ev.flipped(noise, ev.stretch(len(noise)), _SURROGATES, rng)
+        flipped = ev.flipped(noise, ev.stretch(len(noise)), _SURROGATES, rng)
+        draws = log.drawn_noise(model.theta[k], model.effects_in(k), _SURROGATES)
+        drawn.append(draws is not None)
+        draws = flipped if draws is None else whitener(np.moveaxis(draws, 0, -1))
         whiteners.append(whitener)
-        residuals.append(np.concatenate([whitener(e[..., None]), surrogates], axis=1))
+        residuals.append(np.concatenate([whitener(e[..., None]), flipped, draws], axis=1))
         bases.append(jacobian)
         points.append(own)
 
     whitened = Whitened(whiteners)
-    base = whitened.base(model, bases)
+    base = whitened.columns([*model.unknowns, *model.fixed], bases)
+    if not any(drawn):
+        residuals = [e[:, : 1 + _SURROGATES] for e in residuals]
     return _scored(superset, whitened, model, changes, comparable, base, residuals, points)
 
 
@@ -189,12 +210,13 @@ def _scored(
     e: Sequence[np.ndarray],
     points: Sequence[Sequence[cand.Point]],
 ) -> Screen:
-    """Score all changes from their whitened rows."""
-    blocks = whitened.blocks
+    """Score all changes from their whitened rows; columns of the base that are not fitted come last."""
+    blocks, fitted = whitened.blocks, len(model.unknowns)
     grams = [ev.grams(x, b) for x, b in zip(base, blocks, strict=True)]
     pairs = [ev.products(x, y, b) for x, y, b in zip(base, e, blocks, strict=True)]
     mixed, squares = [p[0] for p in pairs], [p[1] for p in pairs]
-    whole = _Whole(sum(grams, np.zeros(())), sum(mixed, np.zeros(())), sum(squares, np.zeros(())))
+    total = sum(grams, np.zeros(()))[:, :fitted, :fitted]
+    whole = _Whole(total, sum(mixed, np.zeros(()))[:, :fitted], sum(squares, np.zeros(())))
     before = ev.held_out(whole.gram, whole.mixed, whole.squares)
     rows = whitened.rows
 
@@ -211,7 +233,10 @@ def _scored(
             largest = np.maximum(largest, gained[1:])
             scores.append(Scored(change, float(gained[0])))
 
-    sums_of = [_points(p, w, x, y) for p, w, x, y in zip(points, whitened.whiteners, base, e, strict=True)]
+    sums_of = [
+        _points(p, w, x[:, :fitted], y)
+        for p, w, x, y in zip(points, whitened.whiteners, base, e, strict=True)
+    ]
     for change in effects:
         found: list[tuple[float, np.ndarray]] = []
         for trial in _trials(change, sums_of, whole, superset.machine.parameters.free):
@@ -224,23 +249,38 @@ def _scored(
             guesses = tuple(guess for _, guess in found[: _guesses_kept(change)])
             scores.append(Scored(change, found[0][0], guesses))
 
-    separate = [
-        ev.held_out(g, m, s) for g, m, s in zip(map(_without_other_logs, grams), mixed, squares, strict=True)
-    ]
-    apart = evidence(np.sum(separate, axis=0))
+    apart = evidence(np.sum(_fitted_apart(model, grams, mixed, squares), axis=0))
     scores.sort(key=lambda s: -s.evidence)
-    return Screen(whitened, float(before[0]), tuple(scores), largest, float(apart[0]), apart[1:])
+    kinds = lambda gained: gained.reshape(-1, _SURROGATES)
+    return Screen(
+        whitened, float(before[0]), tuple(scores), kinds(largest), float(apart[0]), kinds(apart[1:])
+    )
+
+
+def _fitted_apart(
+    model: Model, grams: Sequence[np.ndarray], mixed: Sequence[np.ndarray], squares: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Return the held-out sums of squares of each log, fitted alone."""
+    fitted, both = len(model.unknowns), [*model.unknowns, *model.fixed]
+    out = []
+    for k, (gram, right, total) in enumerate(zip(grams, mixed, squares, strict=True)):
+        # What is held in the first log is fitted in the others.
+        some = [j for j in range(len(both)) if j < fitted or k > 0]
+        out.append(ev.held_out(_without_other_logs(gram[:, some][:, :, some]), right[:, some], total))
+    return out
 
 
 def _parameter_sums(
     change: Change, model: Model, grams: Sequence[np.ndarray], mixed: Sequence[np.ndarray]
 ) -> _Sums:
     """Return the sums of the columns of a parameter in the logs of a change."""
-    column = {u.logs: j for j, u in enumerate(model.unknowns) if u.index == change.index}
+    both = [*model.unknowns, *model.fixed]
+    column = {u.logs: j for j, u in enumerate(both) if u.index == change.index}
+    fitted = len(model.unknowns)
     parts = []
     for k in change.logs:
         j = [next(j for logs, j in column.items() if k in logs)]
-        parts.append(_Sums(grams[k][:, :, j], grams[k][:, j][:, :, j], mixed[k][:, j]))
+        parts.append(_Sums(grams[k][:, :fitted, j], grams[k][:, j][:, :, j], mixed[k][:, j]))
     return _beside(parts) if change.apart else sum(parts[1:], start=parts[0])
 
 

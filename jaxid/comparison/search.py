@@ -117,12 +117,14 @@ class Search:
         logs: The logs, the base first.
         comparable: Indices of the parameters that may differ between logs.
         progress: Called with a line of text at every stage.
+        held: Indices of unknowns that keep their value in the first log; see `Model`.
     """
 
     superset: cand.CandidateModel
     logs: tuple[ComparedLog, ...]
     comparable: tuple[int, ...]
     progress: Callable[[str], None] = lambda text: None
+    held: tuple[int, ...] = ()
     _rounds: dict[frozenset, Round] = field(default_factory=dict)
 
     def start(self, theta: Float[np.ndarray, " p"]) -> Model:
@@ -131,8 +133,13 @@ class Search:
         for values in by_log:
             for c in self.superset.candidates:
                 values[c.index] = c.neutral
-        base = tuple(int(i) for i in self.superset.base)
-        return self.fit(Model(np.stack(by_log), base))
+        base = tuple(int(i) for i in self.superset.base if i not in self.held)
+        model = self.fit(Model(np.stack(by_log), base, held=self.held))
+        renewed = tuple(log.renewed(model.theta[k]) for k, log in enumerate(self.logs))
+        if all(new is old for new, old in zip(renewed, self.logs, strict=True)):
+            return model
+        self.logs = renewed
+        return self.fit(model)
 
     def run(self, start: Model, most: int) -> tuple[Model, list[Named]]:
         """Make changes until none is accepted, drop what became superfluous, and find alternatives.
@@ -225,7 +232,7 @@ class Search:
         if self.chance(best.model, best.change, screen.whitened) * screen.changes > ev.FALSE_POSITIVE:
             return without, None
         others = tuple(r for r in equal if r is not best and r.change.place != best.change.place)
-        chance = ev.false_alarm(best.evidence, screen.largest)
+        chance = screen.false_alarm(best.evidence)
         return best.model, Named(best.change, best.evidence, screen.threshold, chance, others)
 
     def without_superfluous(self, model: Model, changes: Sequence[Change]) -> Model:
@@ -338,7 +345,7 @@ class Search:
         screen = self.round(model).screen
         apart = self.fit(replace(model, changes=(*model.changes, *self._all_apart(model))))
         closed = self.closed(model, apart)
-        if screen.apart > ev.threshold(screen.apart_by_chance) and closed > _MOST_OF_IT:
+        if screen.apart > screen.apart_threshold and closed > _MOST_OF_IT:
             return (
                 f"parameters of their own for each log close {100 * closed:.0f} % of the gap, in squares, "
                 "and no one of them does"
@@ -421,7 +428,7 @@ class Search:
     def _white(self, model: Model, whitened: Whitened) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return columns and residual of a model as rows of unit noise, by log."""
         both = [log.evaluate(model.theta[k], model.fitted_in(k)) for k, log in enumerate(self.logs)]
-        return whitened.base(model, [j for _, j in both]), whitened.residual([e for e, _ in both])
+        return whitened.columns(model.unknowns, [j for _, j in both]), whitened.residual([e for e, _ in both])
 
     def _rows(self, model: Model, whitened: Whitened | None) -> tuple[np.ndarray, np.ndarray]:
         """Return the residual that a fit minimises, and its columns, of all logs one behind the other."""
@@ -489,10 +496,13 @@ def _contrasts(model: Model, change: Change) -> list[tuple[np.ndarray, float]]:
     sets = model.partition(int(change.index or 0))
     inside = [s for s in sets if set(s) <= set(change.logs)]
     rest = [s for s in sets if s not in inside] or inside[:1]
+    # A value that is held is no fitted number.
+    held = change.index in model.held and 0 in rest[0]
+    constant = float(model.theta[0, int(change.index or 0)]) if held else 0.0
     for logs in inside:
         if logs in rest:
             continue
         mine = np.array([float(u.index == change.index and u.logs == logs) for u in unknowns])
         base = np.array([float(u.index == change.index and u.logs == rest[0]) for u in unknowns])
-        out.append((mine - base, 0.0))
+        out.append((mine - base, constant))
     return out

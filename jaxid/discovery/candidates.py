@@ -180,6 +180,11 @@ class View:
         plant = scatter(tuple(self.values), machine.plant, np.array(list(self.values.values())))
         return replace(superset, machine=machine.with_plant(plant, machine.parameters))
 
+    def wanted(self, wanted: Sequence[int] | np.ndarray) -> list[int]:
+        """Return indices of unknowns, with those whose derivatives `jacobian` takes for them."""
+        indices = {int(k) for k in wanted}
+        return sorted(indices | {group[-1] for group in self.shared if indices & set(group)})
+
     def theta(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """Return all unknowns as they hold in this log."""
         out = theta.copy()
@@ -307,8 +312,7 @@ def evaluate_on(
     directions = seeds(superset.colours)
     views = [log.view for log in logs]
     if wanted is not None:
-        last = [group[-1] for view in views if view for group in view.shared if set(group) & {*wanted}]
-        wanted = [*wanted, *last]
+        wanted = [k for view in views for k in (wanted if view is None else view.wanted(wanted))]
     # The choice of directions is data: with a fixed number of columns one compiled function serves all.
     ask = np.unique(colours if wanted is None else colours[np.asarray(wanted, int)])
     parts = [ask[k : k + _COLUMNS] for k in range(0, max(len(ask), 1), _COLUMNS)]

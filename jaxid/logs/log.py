@@ -63,7 +63,7 @@ class Log:
         time: Time [s], from the start of the file.
         position: Positions [m or rad], a column a joint; NaN throughout for a joint without an encoder. None
             with `velocity` given: the integral of the velocity, which starts at zero.
-        force: The logged command, before the known gain of the actuator.
+        force: The logged command, before the known gain of the actuator; None: zero, as none was logged.
         velocity: Measured velocity [m/s or rad/s].
         acceleration: Measured acceleration [m/s^2 or rad/s^2].
         reference: Reference of the controller [m or rad].
@@ -82,7 +82,7 @@ class Log:
 
     time: Column
     position: Column | Any
-    force: Column
+    force: Column | Any
     velocity: Column | None = None
     acceleration: Column | None = None
     reference: Column | None = None
@@ -112,6 +112,10 @@ class Log:
                 raise InputError("neither position nor velocity is given", where=self.source, hint=hint)
             object.__setattr__(self, "position", integral(time, self.velocity))
             object.__setattr__(self, "integrated", True)
+        if self.force is None:
+            drives = np.asarray(self.position if self.reference is None else self.reference)
+            width = drives.shape[1] if drives.ndim == 2 else 1
+            object.__setattr__(self, "force", np.zeros((time.size, width)))
         for name in ("position", "force", *OPTIONAL_COLUMNS):
             given = getattr(self, name)
             if given is None:

@@ -20,6 +20,13 @@ from jaxid.results.report.numbers import plain, with_std
 
 # Files that `save_comparison` writes.
 FILES = ("comparison.json", "report.html")
+# What the noise floor of a compared quantity is.
+FLOOR = {
+    "force": "RMS force that the sensors' noise alone leaves in the band of the filter",
+    "position": "RMS that the encoder's noise alone leaves",
+}
+# A residual above the noise floor by this factor is that of an incomplete model.
+_INCOMPLETE = 2.0
 _EVIDENCE_WORDS = (
     "evidence: gain in log-likelihood on stretches of the logs that a fit did not use, in nats; noise alone "
     f"exceeds the threshold in one of {1 / FALSE_POSITIVE:.0f} comparisons"
@@ -28,7 +35,7 @@ _EVIDENCE_WORDS = (
 
 def comparison_json(result: Comparison) -> dict[str, Any]:
     """Return the content of comparison.json."""
-    unit = result.session.machine.unit_by_joint("force")
+    unit = result.session.machine.unit_by_joint(result.quantity)
     return {
         "verdict": result.verdict,
         "logs": list(result.logs),
@@ -39,7 +46,11 @@ def comparison_json(result: Comparison) -> dict[str, Any]:
         "threshold": result.threshold,
         "false_alarm": FALSE_POSITIVE,
         "parameters": {name: _value(v) for name, v in result.parameters.items()},
-        "gap": {"unit": unit, "logs": {gap.name: _gap(gap) for gap in result.gaps}},
+        "gap": {
+            "quantity": result.quantity,
+            "unit": unit,
+            "logs": {gap.name: _gap(gap) for gap in result.gaps},
+        },
         "preprocess": recipe_json(result.session),
         "versions": versions(),
         "notes": comparison_notes(result),
@@ -83,8 +94,29 @@ def _gap(gap: LogGap) -> dict[str, Any]:
 
 
 def comparison_notes(result: Comparison) -> list[str]:
-    """Return the warnings on the logs."""
-    return [f"{f.where}: {f.what}; {f.hint}" for f in result.session.findings]
+    """Return what was assumed, and the warnings on the logs."""
+    notes = [f"{f.where}: {f.what}; {f.hint}" for f in result.session.findings]
+    if result.scale:
+        notes.insert(
+            0,
+            f"the logs have no force, and nothing known gives one: {result.scale} was held at its guess in "
+            f"{result.logs[0]}, and all values of forces, inertias and gains are relative to it",
+        )
+    most = max(_above_noise(gap) for gap in result.gaps)
+    if result.verdict == "same" and most > _INCOMPLETE:
+        notes.insert(
+            0,
+            f"the model is incomplete: it leaves up to {most:.0f} times the noise of the sensors in all logs "
+            "alike, and a difference that is small beside that is not seen",
+        )
+    return notes
+
+
+def _above_noise(gap: LogGap) -> float:
+    """Return the largest ratio of what is left of a log to its noise floor."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = gap.explained / gap.floor
+    return float(np.max(ratio, initial=0.0, where=np.isfinite(ratio)))
 
 
 def answer(result: Comparison) -> str:
@@ -126,7 +158,7 @@ def comparison_table(result: Comparison) -> str:
     if result.differences:
         lines += ["", aligned(value_rows(result))]
     lines += ["", aligned(gap_rows(result))]
-    lines.append("noise floor: RMS force that the sensors' noise alone leaves in the band of the filter")
+    lines.append(f"noise floor: {FLOOR[result.quantity]}")
     notes = [f"note: {line}" for line in comparison_notes(result)]
     return "\n".join([*lines, *([""] if notes else []), *notes, *reading_lines(result.session)])
 
@@ -152,14 +184,18 @@ def value_rows(result: Comparison) -> list[list[str]]:
 
 
 def _cell(v: Value) -> str:
+    if not np.isfinite(v.std):
+        return f"{plain(v.value)} (held)"
     value, std = with_std(v.value, v.std)
     return f"{value} ± {std}"
 
 
 def gap_rows(result: Comparison) -> list[list[str]]:
-    """Return a header, and the unexplained force of each log."""
-    rows = [["unexplained force (RMS)", "one machine", "with what differs", "noise floor", "unit"]]
-    unit = joined(result.session.machine.unit_by_joint("force"))
+    """Return a header, and the unexplained force or position of each log."""
+    rows = [
+        [f"unexplained {result.quantity} (RMS)", "one machine", "with what differs", "noise floor", "unit"]
+    ]
+    unit = joined(result.session.machine.unit_by_joint(result.quantity))
     if not result.differences:
         rows[0][2] = "as found"
     for gap in result.gaps:

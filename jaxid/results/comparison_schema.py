@@ -83,12 +83,13 @@ _PROPERTIES = {
     "parameters": {"type": "object", "additionalProperties": _VALUE},
     "gap": {
         "type": "object",
-        "description": "RMS of the force that the model leaves unexplained, by log",
+        "description": "RMS of the force or position that the model leaves unexplained, by log",
         "properties": {
+            "quantity": {"enum": ["force", "position"], "description": "what was compared"},
             "unit": {"anyOf": [_WORD, _WORDS]},
             "logs": {"type": "object", "additionalProperties": _GAP},
         },
-        "required": ["unit", "logs"],
+        "required": ["quantity", "unit", "logs"],
     },
     "preprocess": {"type": "object"},
     "versions": {"type": "object", "additionalProperties": _WORD},

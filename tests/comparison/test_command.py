@@ -1,5 +1,6 @@
 """The command `compare`: what it refuses, its files and what it says."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -55,11 +56,14 @@ def test_other_wrong_arguments_are_refused(tmp_path, files, capsys):
         jaxid.compare(files[0], "log.csv")
 
 
-def test_a_log_without_a_force_is_refused_in_one_line(tmp_path, files, capsys, sound):
-    bare = text().replace('force = "u"\n', "")
-    case, log = place(tmp_path / "bare", {k: x for k, x in sound.items() if k != "u"}, bare)
-    other = write_csv(tmp_path / "bare" / "other.csv", {k: x for k, x in sound.items() if k != "u"})
-    refused(capsys, tmp_path, "compare", case, log, other, told="no force, which a comparison needs")
+def test_logs_of_which_only_some_have_a_force_are_refused(files, sound):
+    bare = {name: x for name, x in sound.items() if name != "u"}
+    logs = [
+        jaxid.Log(x["t"], x["q"], x.get("u"), reference=x["ref"], source=f"{k}.csv")
+        for k, x in enumerate((dict(sound), bare))
+    ]
+    with pytest.raises(jaxid.InputError, match="the force is zero throughout"):
+        jaxid.compare(files[0], logs)
 
 
 def test_help_has_examples(capsys):
@@ -177,3 +181,13 @@ def test_an_effect_that_both_lack_is_no_difference(tmp_path):
     found = records(Pair("nothing", "servo", 1.0, 49_001, alike="cogging"), tmp_path)
     assert found.verdict == "same"
     assert found.alike == ("cogging",)
+
+
+def test_an_incomplete_model_is_said_to_hide_small_differences(differing):
+    same = dataclasses.replace(differing, verdict="same", differences=())
+    assert "incomplete" not in str(same)
+    loud = [dataclasses.replace(gap, explained=np.array([7.0])) for gap in same.gaps]
+    lines = str(dataclasses.replace(same, gaps=tuple(loud))).splitlines()
+    assert any("note: the model is incomplete: it leaves up to 7 times the noise" in line for line in lines)
+    # Where something differs the verdict speaks for itself.
+    assert "incomplete" not in str(dataclasses.replace(differing, gaps=tuple(loud)))

@@ -73,3 +73,18 @@ def test_an_effect_is_tried_in_each_log_and_in_all():
     # The first log is the base: a later one comes first.
     assert [c.logs for c in tried] == [(1,), (0,), (0, 1)]
     assert effect_changes([SPRING], model(2, tried[0]), 2) == []
+
+
+def test_a_value_that_gives_the_scale_is_held_in_the_first_log_only():
+    payload = Change("inertia", (1,), 2, index=0)
+    held = Model(np.array([[1.0, 2.0, 0.0], [1.0, 2.0, 0.0]]), (1,), held=(0,))
+    assert [u.index for u in held.unknowns] == [1]
+    assert [(u.index, u.logs) for u in held.fixed] == [(0, (0, 1))]
+
+    loaded = held.with_change(payload)
+    assert [(u.index, u.logs) for u in loaded.unknowns] == [(1, (0, 1)), (0, (1,))]
+    assert [(u.index, u.logs) for u in loaded.fixed] == [(0, (0,))]
+    moved = loaded.at(np.array([3.0, 5.0]))
+    assert moved.theta[:, 0].tolist() == [1.0, 5.0]
+    # It keeps its value where the logs share it again, and takes no mean.
+    assert moved.without(payload).theta[:, 0].tolist() == [1.0, 1.0]

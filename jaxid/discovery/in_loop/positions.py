@@ -39,7 +39,7 @@ _SPRUNG, _TURN = 4, 0.25
 # Number of times that noise and starts are estimated, and the unknowns refitted.
 _RENEWALS = 2
 # Part of the motion that integration leaves wrong in any model.
-_NUMERICS = 1e-5
+NUMERICS = 1e-5
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ class LoopAcceptance(Acceptance):
         self.samples, *self.others = self.logs
         moving = self.samples.moving
         spread = np.std(self.samples.measured, axis=0)
-        self._numerics = float(np.sum(moving * np.square(_NUMERICS * spread)))
+        self._numerics = float(np.sum(moving * np.square(NUMERICS * spread)))
         self._noise = float(np.sum(moving.sum(axis=0) * np.square(self.floor)))
 
     @property

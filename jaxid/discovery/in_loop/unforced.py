@@ -70,7 +70,7 @@ def explore_unforced(session: Session, *, max_effects: int, progress: Callable[[
         raise InputError(what, where=session.case.where, hint="leave `set` out of [[validation]]")
     progress("fitting the declared model")
     before = run_alone(steps_of("output_error", session))
-    fitted, base = _at_scale(before)
+    fitted, base = at_scale(before)
     search = _search(session, fitted, progress)
     steps = search.run(max_effects)
     alternatives = search.alternatives(steps)
@@ -119,21 +119,26 @@ def searched(session: Session, machine: Machine) -> list[type[Effect]]:
     return sorted(apart, key=lambda cls: cls.adds_spring)
 
 
-def _at_scale(estimate: Estimate) -> tuple[Machine, int | None]:
+def at_scale(estimate: Estimate) -> tuple[Machine, int | None]:
     """Return a fitted machine with the unknown held that gives the scale, and its index; None without."""
+    machine, base = loop_machine(estimate)
+    return (machine, None) if base is None else (without(machine, base), base)
+
+
+def loop_machine(estimate: Estimate) -> tuple[Machine, int | None]:
+    """Return a fitted machine, and the index of the unknown that gives the scale; None if something does."""
     relative = estimate.details.get("relative")
     if relative is None:
         return estimate.machine, None
-    base = estimate.machine.parameters.names.index(relative["to"])
-    return without(estimate.machine, base), base
+    return estimate.machine, estimate.machine.parameters.names.index(relative["to"])
 
 
 def _search(session: Session, machine: Machine, progress: Callable[[str], None]) -> LoopSearch:
     """Return the search for the effects that a fitted machine lacks."""
     log = session.fit.log
-    data = _with_command(session, machine)
+    data = with_command(session, machine)
     numerics = choose_numerics(machine, log)
-    between = _largest_force(machine, log, numerics)
+    between = largest_force(machine, log, numerics)
     superset = build_candidate_model(machine, data, searched(session, machine), between)
     at_fit = superset.machine
     period = log.period if machine.controller is None else machine.controller.period
@@ -152,7 +157,7 @@ def _search(session: Session, machine: Machine, progress: Callable[[str], None])
     )
 
 
-def _with_command(session: Session, machine: Machine) -> Prepared:
+def with_command(session: Session, machine: Machine) -> Prepared:
     """Return the prepared log with the simulated force of the drives, which gives the scale of effects."""
     data = session.fit.data
     (gap,) = gaps(machine, (session.fit,))
@@ -165,7 +170,7 @@ def _with_command(session: Session, machine: Machine) -> Prepared:
     return replace(data, force=gap.simulation.command * machine.gain, moving=np.ones_like(data.moving))
 
 
-def _largest_force(machine: Machine, log: Log, numerics: Numerics) -> Float[np.ndarray, " m"]:
+def largest_force(machine: Machine, log: Log, numerics: Numerics) -> Float[np.ndarray, " m"]:
     """Return the largest absolute force of each drive at all ticks of the simulated loop, (m,)."""
     replay = make_replay(machine, log, numerics)
     run = _run(replace(replay, every=1), machine.plant)

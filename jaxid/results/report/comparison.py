@@ -23,7 +23,8 @@ _NEVER = 1e-12
 
 def comparison_report(result: Comparison) -> str:
     """Return the report of `compare` as one page of HTML."""
-    unit = result.session.machine.unit_by_joint("force")
+    quantity = result.quantity
+    unit = result.session.machine.unit_by_joint(quantity)
     units = [unit] * len(result.gaps[0].floor) if isinstance(unit, str) else list(unit)
     several = len(result.gaps[0].floor) > 1
 
@@ -31,9 +32,9 @@ def comparison_report(result: Comparison) -> str:
     for gap in result.gaps:
         for joint in np.flatnonzero(np.isfinite(gap.shared)):
             name = f"{gap.name}, joint {joint + 1}" if several else gap.name
-            words = f"{name}: unexplained force over time"
+            words = f"{name}: unexplained {quantity} over time"
             draw = lambda size, gap=gap, joint=joint: plot_gap(
-                gap, int(joint), units[joint], size, named=bool(result.differences)
+                gap, int(joint), (quantity, units[joint]), size, named=bool(result.differences)
             )
             residuals.append((name, with_narrow(image(draw(_WIDE), words), draw(_NARROW))))
 
@@ -60,6 +61,7 @@ def comparison_report(result: Comparison) -> str:
         ],
         tried=result.tried,
         gaps=gap_rows(result),
+        quantity=quantity,
         residuals=residuals,
         parameters=[_row(name, v) for name, v in result.parameters.items()],
         notes=comparison_notes(result),
@@ -84,17 +86,20 @@ def plot_values(result: Comparison) -> Figure:
     return figure
 
 
-def plot_gap(gap: LogGap, joint: int, unit: str, size: tuple[float, float], *, named: bool) -> Figure:
-    """Draw the unexplained force of one joint of one log over time.
+def plot_gap(
+    gap: LogGap, joint: int, signal: tuple[str, str], size: tuple[float, float], *, named: bool
+) -> Figure:
+    """Draw the unexplained force or position of one joint of one log over time.
 
     Args:
         gap: The log.
         joint: The joint, 0-based.
-        unit: Label of the force.
+        signal: What was compared, and its unit.
         size: Width and height [inch].
         named: Whether differences were found, so that there are two residuals.
     """
     figure, ax, _ = time_axes(size, 1, (1, 1))
+    quantity, unit = signal
     factor, label = scaled_unit(unit, [gap.before[:, joint]])
     lines = [("one machine", BEFORE, gap.before), ("with what differs", AFTER, gap.after)]
     for name, colour, residual in lines if named else lines[:1]:
@@ -102,7 +107,7 @@ def plot_gap(gap: LogGap, joint: int, unit: str, size: tuple[float, float], *, n
         curve = envelope(gap.time[shown], residual[shown, joint] / factor, bucket_count(size))
         ax.plot(*curve, color=colour, lw=0.9, label=name)
     ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
-    dress(ax, "time [s]", f"unexplained force [{label}]")
+    dress(ax, "time [s]", f"unexplained {quantity} [{label}]")
     legend(ax)
     return figure
 
