@@ -2,6 +2,7 @@
 
 import threading
 
+import jax
 import numpy as np
 import pytest
 
@@ -109,4 +110,6 @@ def test_what_has_begun_runs_beside_and_its_error_is_that_of_its_result(seen):
 
 
 def test_the_compiler_knows_the_option_that_halves_its_time():
-    assert quick_to_compile() == {"xla_cpu_use_fusion_emitters": False}
+    # The compiler of JAX 0.12 has no other emitters, and no such option.
+    newer = tuple(int(part) for part in jax.__version__.split(".")[:2]) >= (0, 12)
+    assert quick_to_compile() == ({} if newer else {"xla_cpu_use_fusion_emitters": False})
