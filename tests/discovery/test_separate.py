@@ -32,8 +32,6 @@ AXIS = Machine(Axis(1.0), Parameters(()), np.ones(1), Units())
 SPRINGS = ("cubic_stiffness", "quadratic_stiffness")
 
 
-# Known miss, 2026-11-25: 52 nats are expected of the experiment, slow turns of 12 mm; the search on its log
-# sees 7 of the true effect and 14 of a constant force.
 # What was minimised on the way to a proposal: arguments, value and gradient.
 CALLS = []
 

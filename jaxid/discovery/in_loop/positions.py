@@ -27,6 +27,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import in_threads
+from jaxid.session import OpenedLog
 from jaxid.simulation.noisy_loop import ReadingNoise, drawn_readings, estimated_noise
 from jaxid.simulation.replay import Numerics, Replay, make_replay
 from jaxid.simulation.step_size import fastest_rate
@@ -48,6 +49,9 @@ class LoopSamples:
 
     Args:
         log: The log.
+        machine: The machine of this log at fitted values, without candidates. The noise in its loop takes
+            hundreds of runs, which the superset would make slow.
+        view: The unknowns of the superset as this log has them; None: it is the only one.
         quiet: The simulation without noise: without effects that add a spring, and with them.
         calm, sprung: The same, shifted to the mean readings of a loop with noise, if that is known.
         moving: Mask of the samples that count: all of joints with an encoder.
@@ -56,6 +60,8 @@ class LoopSamples:
     """
 
     log: Log
+    machine: Machine
+    view: cand.View | None
     quiet: tuple[Replay, Replay]
     calm: Replay
     sprung: Replay
@@ -69,19 +75,35 @@ class LoopSamples:
         """Measured position, (time, n)."""
         return self.log.filled
 
+    @property
+    def parts(self) -> tuple[LoopSamples, ...]:
+        """The logs: this one."""
+        return (self,)
+
     @classmethod
-    def of(cls, machine: Machine, log: Log, numerics: Numerics) -> LoopSamples:
-        """Return the samples of a log that a machine follows.
+    def of(
+        cls,
+        run: OpenedLog,
+        machine: Machine,
+        superset: cand.CandidateModel,
+        numerics: Numerics,
+        view: cand.View | None = None,
+    ) -> LoopSamples:
+        """Return the samples of a log whose loop is simulated.
 
         Args:
-            machine: The machine with the disturbance of the log, without candidates.
-            log: The log.
+            run: The log.
+            machine: The machine of the case at fitted values, without candidates.
+            superset: The machine with all candidates.
             numerics: Settings of the integration without an added spring.
+            view: The unknowns of the superset as this log has them; None: it is the only one.
         """
+        log, mine = run.log, superset if view is None else view.superset(superset)
         moving = np.tile(np.array(log.measured), (log.samples, 1))
         finer = replace(numerics, substeps=max(_SPRUNG, numerics.substeps))
-        calm, sprung = (make_replay(machine, log, n) for n in (numerics, finer))
-        return cls(log, (calm, sprung), calm, sprung, moving, moving.astype(float))
+        calm, sprung = (make_replay(run.machine(mine.machine), log, n) for n in (numerics, finer))
+        replays = ((calm, sprung), calm, sprung)
+        return cls(log, run.machine(machine), view, *replays, moving, moving.astype(float))
 
     def with_noise(self, noise: ReadingNoise | None) -> LoopSamples:
         """Return the samples whose loops are shifted to the mean readings with a noise of the encoder."""
@@ -89,6 +111,78 @@ class LoopSamples:
             return self
         calm, sprung = (noise.on(replay) for replay in self.quiet)
         return replace(self, calm=calm, sprung=sprung, noise=noise)
+
+    def renewed(
+        self, superset: cand.CandidateModel, added: Sequence[cand.Candidate], theta: np.ndarray
+    ) -> LoopSamples:
+        """Return the samples with the noise of the encoder as it is beside a model.
+
+        Args:
+            superset: The machine with all candidates.
+            added: Effects of the model.
+            theta: All unknowns of the superset.
+        """
+        machine, replay = self._alone(superset, added, theta)
+        return self.with_noise(estimated_noise(machine, self.log, replay, follows=False))
+
+    def drawn_noise(
+        self, superset: cand.CandidateModel, added: Sequence[cand.Candidate], theta: np.ndarray, runs: int
+    ) -> Float[np.ndarray, "runs time n"] | None:
+        """Draw residuals of a model by the noise in its loop; None if nothing is known of the noise.
+
+        Args:
+            superset, added, theta: As in `renewed`.
+            runs: Number of draws.
+        """
+        if self.noise is None:
+            return None
+        machine, replay = self._alone(superset, added, theta)
+        replay = replay.following(machine.parameters.places, machine.parameters.guess)
+        scale = 1.0 if self.view is None else self.view.scale
+        return drawn_readings(self.noise, replay, machine.plant, runs) * scale
+
+    def _alone(
+        self, superset: cand.CandidateModel, added: Sequence[cand.Candidate], theta: np.ndarray
+    ) -> tuple[Machine, Replay]:
+        """Return the machine with some effects only, and its loop without noise."""
+        springs = any(cand.effect_of(superset, c).adds_spring for c in added)
+        names, known = superset.machine.parameters.names, self.machine.parameters.names
+        mine = replace(superset, base=np.array([names.index(name) for name in known], int))
+        at = theta if self.view is None else self.view.theta(theta)
+        return machine_with(self.machine, mine, added, at)[0], self.quiet[springs]
+
+
+@dataclass(frozen=True)
+class JoinedLoops:
+    """Several logs whose loops are simulated, one behind the other; see `jaxid.discovery.domain.Samples`.
+
+    Args:
+        parts: The logs; each has a view.
+        moving: Mask of the samples that count; the first of each further log does not, as it does not
+            continue the one before it.
+        weight: The same as numbers.
+    """
+
+    parts: tuple[LoopSamples, ...]
+    moving: Bool[np.ndarray, "time n"]
+    weight: Float[np.ndarray, "time n"]
+    noisier: list[Any] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, parts: Sequence[LoopSamples]) -> JoinedLoops:
+        """Join logs."""
+        moving = [part.moving.copy() for part in parts]
+        for mask in moving[1:]:
+            mask[0] = False
+        joined = np.concatenate(moving)
+        return cls(tuple(parts), joined, joined.astype(float))
+
+    def with_parts(self, parts: Sequence[LoopSamples]) -> JoinedLoops:
+        """Return the same logs with other simulations."""
+        return replace(self, parts=tuple(parts))
+
+
+Loops = LoopSamples | JoinedLoops
 
 
 @dataclass(frozen=True)
@@ -111,14 +205,34 @@ class PositionDomain:
         springs = sum(cand.effect_of(superset, c).adds_spring for c in superset.candidates)
         return cls(superset, springs, period / max(_SPRUNG, numerics.substeps))
 
-    def noisier(self, samples: LoopSamples, theta: np.ndarray) -> np.ndarray:
+    def noisier(self, samples: Loops, theta: np.ndarray) -> np.ndarray:
         """Refuse: the loop's reference has no noise, so that no search asks for this."""
         raise NotImplementedError
 
     def evaluate(
-        self, samples: LoopSamples, theta: np.ndarray, wanted: Sequence[int] | np.ndarray | None = None
+        self, samples: Loops, theta: np.ndarray, wanted: Sequence[int] | np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the residual, (time, n), and its derivatives, (time, n, p); columns not wanted are zero."""
+        """Compute the residual, (time, n), and its derivatives, (time, n, p); columns not wanted are zero.
+
+        Those of several logs follow each other, on the scale of their views.
+        """
+        found = []
+        for part in samples.parts:
+            view = part.view
+            if view is None:
+                found.append(self._evaluate(part, theta, wanted))
+                continue
+            asked = None if wanted is None else view.wanted(wanted)
+            e, jacobian = self._evaluate(part, view.theta(theta), asked)
+            found.append((e * view.scale, view.jacobian(jacobian)))
+        if len(found) == 1:
+            return found[0]
+        return np.concatenate([e for e, _ in found]), np.concatenate([j for _, j in found])
+
+    def _evaluate(
+        self, samples: LoopSamples, theta: np.ndarray, wanted: Sequence[int] | np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute residual and derivatives of one log, at unknowns as they hold in it."""
         ask = np.arange(len(theta)) if wanted is None else np.unique(np.asarray(wanted, int))
         replay, plant, places = self._simulated(samples, theta, ask)
         known = theta[: len(places)]
@@ -142,8 +256,8 @@ class PositionDomain:
         self, samples: LoopSamples, theta: np.ndarray, ask: np.ndarray
     ) -> tuple[Replay, Plant, tuple]:
         """Return the simulation with plant and unknowns, without springs if none of them acts."""
-        machine = self.superset.machine
-        places, plant = machine.parameters.places, machine.plant
+        superset = self.superset if samples.view is None else samples.view.superset(self.superset)
+        places, plant = superset.machine.parameters.places, superset.machine.plant
         if not self.springs:
             return samples.calm, plant, places
         of_springs = np.concatenate([c.index for c in self.superset.candidates[-self.springs :]])
@@ -154,7 +268,7 @@ class PositionDomain:
         return samples.calm, calm, places[: of_springs[0]]
 
     def points(
-        self, rest: list[cand.Candidate], samples: LoopSamples, theta: np.ndarray, residual: np.ndarray
+        self, rest: list[cand.Candidate], samples: Loops, theta: np.ndarray, residual: np.ndarray
     ) -> list[cand.Point]:
         """Linearise candidates at each of their starts, beside a model."""
         out = []
@@ -183,12 +297,12 @@ class PositionDomain:
     def _spring(self, c: cand.Candidate) -> bool:
         return cand.effect_of(self.superset, c).adds_spring
 
-    def _followed(self, c: cand.Candidate, start: int, samples: LoopSamples) -> bool:
+    def _followed(self, c: cand.Candidate, start: int, samples: Loops) -> bool:
         """Check that the steps follow the frequency of a spring at one of its starts."""
         effect = cand.effect_at(self.superset, c, c.starts[start])
         alone = replace(self.superset.machine.plant, effects=(effect,))
         still = np.zeros((1, len(self.superset.machine.gain)))
-        return float(fastest_rate(alone, samples.measured[:1], still)) * self.step < _TURN
+        return float(fastest_rate(alone, samples.parts[0].measured[:1], still)) * self.step < _TURN
 
 
 @kept_jit
@@ -204,11 +318,11 @@ class LoopAcceptance(Acceptance):
 
     Args:
         positions: The domain.
-        logs: Samples of the fitted log, then of the validation logs.
+        logs: Samples of the fitted logs, then of each validation log.
     """
 
     positions: PositionDomain | None = None
-    logs: tuple[LoopSamples, ...] = ()
+    logs: tuple[Loops, ...] = ()
 
     # The noise of an encoder is known better than that of a force.
     least_gap: ClassVar[float] = 0.05
@@ -217,10 +331,11 @@ class LoopAcceptance(Acceptance):
         assert self.positions is not None, "given by the search"
         self.domain: Domain = self.positions
         self.samples, *self.others = self.logs
-        moving = self.samples.moving
-        spread = np.std(self.samples.measured, axis=0)
-        self._numerics = float(np.sum(moving * np.square(NUMERICS * spread)))
-        self._noise = float(np.sum(moving.sum(axis=0) * np.square(self.floor)))
+        self._numerics = sum(
+            float(np.sum(part.moving * np.square(NUMERICS * _scaled(part, np.std(part.measured, axis=0)))))
+            for part in self.samples.parts
+        )
+        self._noise = float(np.sum(self.samples.moving.sum(axis=0) * np.square(self.floor)))
 
     @property
     def _independent(self) -> float:
@@ -231,19 +346,21 @@ class LoopAcceptance(Acceptance):
         return False
 
 
+def _scaled(part: LoopSamples, values: np.ndarray) -> np.ndarray:
+    """Return values by joint on the scale of a log's view."""
+    return values if part.view is None else values * part.view.scale
+
+
 @dataclass
 class LoopSearch(Search):
     """A search whose models are compared with positions.
 
     Args:
         positions, logs: Those of `LoopAcceptance`.
-        machine: The fitted machine, without candidates. The noise in its loop takes hundreds of runs, which
-            the superset would make slow.
     """
 
     positions: PositionDomain | None = None
-    logs: tuple[LoopSamples, ...] = ()
-    machine: Machine | None = None
+    logs: tuple[Loops, ...] = ()
 
     def _acceptance(self) -> Acceptance:
         shared = (self.superset, self.data, self.validation, self.floor, self.colour)
@@ -252,26 +369,20 @@ class LoopSearch(Search):
     def renewed(self, model: Model) -> Model:
         """Return a model refitted with the noise of the encoder and the starts as they are beside it."""
         for _ in range(_RENEWALS):
-            at = [(samples, *self._alone(samples, model)) for samples in self.logs]
-            noises = [estimated_noise(m, samples.log, replay, follows=False) for samples, m, replay in at]
-            self.logs = tuple(s.with_noise(noise) for s, noise in zip(self.logs, noises, strict=True))
+            renewed: list[Loops] = []
+            for samples in self.logs:
+                parts = [part.renewed(self.superset, model.added, model.theta) for part in samples.parts]
+                renewed.append(samples.with_parts(parts) if isinstance(samples, JoinedLoops) else parts[0])
+            self.logs = tuple(renewed)
             self.samples, *others = self.logs
             self.acceptance.samples, self.acceptance.others = self.samples, others
             model = replace(model, theta=self.fit(model.theta, self.fitted_by(model.added)))
         return model
 
     def drawn_noise(self, model: Model, runs: int) -> Float[np.ndarray, "runs time n"] | None:
-        """Draw residuals of the fitted log by the noise in its loop."""
-        noise = self.samples.noise
-        if noise is None:
-            return None
-        machine, replay = self._alone(self.samples, model)
-        replay = replay.following(machine.parameters.places, machine.parameters.guess)
-        return drawn_readings(noise, replay, machine.plant, runs)
-
-    def _alone(self, samples: LoopSamples, model: Model) -> tuple[Machine, Replay]:
-        """Return the machine of a model without the other candidates, and its loop without noise."""
-        assert self.machine is not None, "given by the search"
-        machine, _ = machine_with(self.machine, self.superset, model.added, model.theta)
-        springs = any(cand.effect_of(self.superset, c).adds_spring for c in model.added)
-        return machine, samples.quiet[springs]
+        """Draw residuals of the fitted logs by the noise in their loops; None if it is not known of one."""
+        drawn = [
+            part.drawn_noise(self.superset, model.added, model.theta, runs) for part in self.samples.parts
+        ]
+        known = [one for one in drawn if one is not None]
+        return np.concatenate(known, axis=1) if len(known) == len(drawn) else None

@@ -7,15 +7,16 @@ promising. Effects that act on the command and on the error of the controller ta
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.discovery.candidates import View
 from jaxid.discovery.final import final_machine
-from jaxid.discovery.in_loop.positions import LoopSamples, LoopSearch, PositionDomain
+from jaxid.discovery.in_loop.positions import JoinedLoops, Loops, LoopSamples, LoopSearch, PositionDomain
 from jaxid.discovery.result import Discovery, Round
 from jaxid.discovery.search import Step
 from jaxid.discovery.superset import build_candidate_model
@@ -24,8 +25,9 @@ from jaxid.errors import InputError
 from jaxid.estimators import steps_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import output_error_steps
+from jaxid.estimators.several.parts import parts_of
 from jaxid.estimators.simulated_output import choose_numerics
-from jaxid.estimators.unforced import fitted_with_noise, scale_group, with_free_scale, without
+from jaxid.estimators.unforced import common_scale_group, fitted_with_noise, with_free_scale, without
 from jaxid.gap import Gap, gaps
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
@@ -36,7 +38,7 @@ from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import run_alone
 from jaxid.numerics.precision import NoiseModel
 from jaxid.results.verdict.completeness import position_residuals
-from jaxid.session import Session
+from jaxid.session import OpenedLog, Session
 from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import Numerics, Replay, make_replay
 from jaxid.simulation.sensor_noise import position_noise
@@ -61,13 +63,8 @@ def explore_unforced(session: Session, *, max_effects: int, progress: Callable[[
         progress: Called with a line of text at every stage.
 
     Raises:
-        InputError: If there are several fitted logs, a validation log has values of its own, or the loop
-            cannot be simulated.
+        InputError: If the loop cannot be simulated.
     """
-    session.need_one_log("discover without a force")
-    if any(run.own is not None for run in session.validations):
-        what = "a search without a force takes no values of a log of its own"
-        raise InputError(what, where=session.case.where, hint="leave `set` out of [[validation]]")
     progress("fitting the declared model")
     before = run_alone(steps_of("output_error", session))
     fitted, base = at_scale(before)
@@ -87,7 +84,7 @@ def explore_unforced(session: Session, *, max_effects: int, progress: Callable[[
     return Discovery(
         session=session,
         verdict=verdict,
-        where=None if verdict == "nothing_missing" else _where(session.fit.log, old[0]),
+        where=None if verdict == "nothing_missing" else _where(session.fits, old),
         effects=effects,
         rounds=_rounds(search, steps, old, new),
         before=before,
@@ -135,15 +132,25 @@ def loop_machine(estimate: Estimate) -> tuple[Machine, int | None]:
 
 def _search(session: Session, machine: Machine, progress: Callable[[str], None]) -> LoopSearch:
     """Return the search for the effects that a fitted machine lacks."""
+    first = session.fit.machine(machine)
     log = session.fit.log
     data = with_command(session, machine)
-    numerics = choose_numerics(machine, log)
-    between = largest_force(machine, log, numerics)
+    numerics = choose_numerics(first, log)
+    between = largest_force(first, log, numerics)
     superset = build_candidate_model(machine, data, searched(session, machine), between)
-    at_fit = superset.machine
     period = log.period if machine.controller is None else machine.controller.period
-    floor = position_noise(machine, log)
-    logs = (session.fit, *session.validations)
+    floor = position_noise(first, log)
+
+    def samples(run: OpenedLog) -> LoopSamples:
+        at_fit = run.machine(machine)
+        view = None
+        if run.own is not None:
+            own = position_noise(at_fit, run.log)
+            scale = np.where((own > 0) & (floor > 0), floor / np.where(own > 0, own, 1.0), 1.0)
+            view = View.of(superset.machine, run.own, scale if run in session.fits else np.ones_like(scale))
+        return LoopSamples.of(run, machine, superset, choose_numerics(at_fit, run.log), view)
+
+    fits = [samples(run) for run in session.fits]
     return LoopSearch(
         superset,
         data,
@@ -152,8 +159,10 @@ def _search(session: Session, machine: Machine, progress: Callable[[str], None])
         tuple(run.data for run in session.validations),
         progress,
         positions=PositionDomain.of(superset, period, numerics),
-        logs=tuple(LoopSamples.of(run.machine(at_fit), run.log, numerics) for run in logs),
-        machine=machine,
+        logs=(
+            JoinedLoops.of(fits) if len(fits) > 1 else fits[0],
+            *[samples(run) for run in session.validations],
+        ),
     )
 
 
@@ -184,23 +193,28 @@ def _run(replay: Replay, plant: Plant) -> Trajectory:
 
 def _refitted(session: Session, final: Machine, base: int | None) -> Estimate:
     """Refit a machine with what was found, from its values; the scale stays free if nothing gives it."""
-    stated, log = session.case.output_error, session.fit.log
-    demands = session.case.identification
+    stated, demands = session.case.output_error, session.case.identification
     options: dict[str, Any] = {"minimiser": stated.minimiser, "hessian": demands.hessian}
-    held = run_alone(fitted_with_noise(final, log, final.parameters.guess, **options))
-    held = held or run_alone(output_error_steps(final, log, start=None, **options))
+    held = None
+    if not session.more:
+        held = run_alone(fitted_with_noise(final, session.fit.log, final.parameters.guess, **options))
+    if held is None:
+        fitted = parts_of(session.with_machine(final)) if session.more else session.fit.log
+        held = run_alone(output_error_steps(final, fitted, start=None, **options))
     if base is None:
         return held
     free = session.machine.parameters.free[base]
     parameters = final.parameters.free
     whole = replace(final.parameters, free=(*parameters[:base], free, *parameters[base:]))
     machine = final.with_plant(final.plant, whole)
-    return with_free_scale(held, machine, scale_group(machine, log), base)
+    group = common_scale_group(machine, parts_of(session.with_machine(machine)))
+    return with_free_scale(held, machine, group, base)
 
 
 def _without_effects(session: Session, estimate: Estimate, found: tuple[Gap, ...]) -> str:
-    """Return the verdict if nothing was added: whether what is left of the fitted log is noise."""
-    left = position_residuals(estimate.machine, session.fit, found[0].simulation)
+    """Return the verdict if nothing was added: whether what is left of the fitted logs is noise."""
+    pairs = zip(session.fits, found, strict=False)
+    left = [r for run, gap in pairs for r in position_residuals(estimate.machine, run, gap.simulation)]
     return "unexplained" if any(r.complete is False for r in left) else "nothing_missing"
 
 
@@ -210,9 +224,12 @@ def _rounds(
     """Return the steps with the RMS of the position that each leaves, on the fitted and validation logs."""
     none = np.full(search.samples.moving.shape[1], np.nan)
 
-    def left(samples: LoopSamples, theta: np.ndarray) -> np.ndarray:
-        e = np.where(samples.moving, search.domain.evaluate(samples, theta, ())[0], np.nan)
-        return np.sqrt(np.nanmean(e**2, axis=0))
+    def left(samples: Loops, theta: np.ndarray) -> np.ndarray:
+        parts = []
+        for part in samples.parts:
+            e = search.domain.evaluate(part, theta, ())[0]
+            parts.append(np.where(part.moving, e if part.view is None else e / part.view.scale, np.nan))
+        return np.sqrt(np.nanmean(np.concatenate(parts) ** 2, axis=0))
 
     out = []
     for step in steps:
@@ -222,18 +239,25 @@ def _rounds(
     return tuple(out)
 
 
-def _where(log: Log, gap: Gap) -> Where | None:
-    """Return the time in which the position that the declared model leaves is largest."""
-    if gap.simulation is None:
+def _where(runs: Sequence[OpenedLog], found: Sequence[Gap]) -> Where | None:
+    """Return the log and time in which the position that the declared model leaves is largest."""
+    seen = [
+        (run, gap.simulation) for run, gap in zip(runs, found, strict=False) if gap.simulation is not None
+    ]
+    if not seen:
         return None
-    e = np.nan_to_num(log.position - gap.simulation.position)
+    run, simulation = max(seen, key=lambda one: float(np.nanmax(one[1].rms)))
+    log = run.log
+    e = np.nan_to_num(log.position - simulation.position)
     window = max(10, round(_WINDOW * log.samples))
     squares = np.square(e)
     joint = int(np.argmax(np.sum(squares, axis=0)))
     power = np.convolve(squares[:, joint], np.ones(window), "valid")
     k = int(np.argmax(power))
     begin, end = (float(log.time[i] - log.time[0]) for i in (k, k + window - 1))
-    at = f"joint {joint + 1}: " if e.shape[1] > 1 else ""
-    text = f"{at}the simulated position is farthest from the log between {begin:.3g} and {end:.3g} s"
+    at = [run.name] if len(runs) > 1 else []
+    at += [f"joint {joint + 1}"] if e.shape[1] > 1 else []
+    text = f"the simulated position is farthest from the log between {begin:.3g} and {end:.3g} s"
+    text = ": ".join([", ".join(at), text]) if at else text
     part = float(power[k] / max(np.sum(squares[:, joint]), 1e-300))
     return Where.in_time(joint + 1, (begin, end), text, part)

@@ -19,13 +19,13 @@ def summed(logs: list[Rows], slope: np.ndarray) -> Model:
     """
     cost, q = 0.0, slope.size
     gradient, normal = np.zeros(q), np.zeros((q, q))
-    for log in logs:
-        # A step may lead where a simulation diverges: its cost is no finite number, and it is refused.
-        with np.errstate(invalid="ignore", over="ignore"):
+    # A step may lead where a simulation diverges: its cost is no finite number, and it is refused.
+    with np.errstate(invalid="ignore", over="ignore"):
+        for log in logs:
             e, columns = log.residual.ravel(), log.jacobian.reshape(-1, q) * slope
-        cost += 0.5 * log.weight * float(e @ e)
-        gradient += log.weight * (columns.T @ e)
-        normal += log.weight * (columns.T @ columns)
+            cost += 0.5 * log.weight * float(e @ e)
+            gradient += log.weight * (columns.T @ e)
+            normal += log.weight * (columns.T @ columns)
     return Model(cost, gradient, normal, logs)
 
 
