@@ -90,6 +90,23 @@ def test_no_body_has_less_than_the_floor():
         assert cost(found + 1e-4 * rng.uniform() * (body - found)) > floor
 
 
+def test_a_step_that_rounding_leads_out_of_the_set_is_refused():
+    """Directions that only rounding determines, on the edge of the set: each result is a body."""
+    start_inside = jax.jit(
+        lambda columns, rest, theta: inner_start(columns, rest, theta, (tuple(range(10)),), eliminated)[0]
+    )
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        true, guess = arm_oracle.bodies(2, rng)
+        seen = rng.permutation(10)[:5]
+        columns = 1e-13 * rng.normal(size=(40, 10))
+        columns[:, seen] = 100 * rng.normal(size=(40, 5))
+        rest = -columns @ (true * np.where(np.isin(np.arange(10), seen), rng.uniform(-1, 1, 10), 1.0))
+        found = start_inside(columns, rest, jnp.asarray(guess))
+        assert np.linalg.eigvalsh(arm_oracle.pseudo_inertias([found])[0])[0] > 0, seed
+        assert np.all(np.isfinite(log_cholesky(found))), seed
+
+
 def motion(seed: int, rate: float = RATE) -> tuple[np.ndarray, ...]:
     """Sums of sines, and their derivatives."""
     rng, t = np.random.default_rng(seed), np.arange(0, SECONDS, 1 / rate)[:, None, None]

@@ -9,13 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.arms.pseudo_inertia import pseudo_inertia
+from jaxid.arms.pseudo_inertia import log_cholesky, pseudo_inertia
 from jaxid.arrays import Array
 
 # Number of weights of the barrier, each with two Newton steps, and ratio of the last to the first.
 _WEIGHTS, _LAST = 112, 1e-14
 # Largest decrement of the last Newton step, in units of the weight, for a point near the central path.
 _ON_PATH = 0.25
+# A point counts as feasible if one farther from the start by this part is a body too: rounding is smaller.
+_MARGIN = 1e-12
 
 
 def inner_start(
@@ -28,10 +30,10 @@ def inner_start(
     """Minimise the sum of squares of columns @ theta + rest over bodies with positive pseudo-inertia P.
 
     A barrier, minus the logarithms of the determinants of P, times a decreasing weight, keeps the bodies
-    feasible. Damped Newton steps never leave the feasible set. With the trace the barrier is the divergence
-    tr(P0^-1 P) - log det(P0^-1 P) from the start P0, which is smallest at the start: unidentifiable
-    directions end at the bodies nearest to it. Without the trace, unidentifiable masses would diverge, and
-    the steps would leave the central path.
+    feasible. Damped Newton steps leave the feasible set by rounding only; such a step is refused. With the
+    trace the barrier is the divergence tr(P0^-1 P) - log det(P0^-1 P) from the start P0, which is smallest at
+    the start: unidentifiable directions end at the bodies nearest to it. Without the trace, unidentifiable
+    masses would diverge, and the steps would leave the central path.
 
     Args:
         columns, rest: Matrix (rows, p) and constant (rows,) of the affine residual.
@@ -46,6 +48,7 @@ def inner_start(
         Boyd & Vandenberghe (2004), Convex Optimization, chapters 9.6 and 11, for path and damping; Lee,
         Wensing & Park (2020), IEEE Trans. Robotics 36(1), for the divergence.
     """
+    start = theta
     normal, slope = columns.T @ columns, columns.T @ rest
     places = np.array(bodies)
     unit = pseudo_inertia(jnp.eye(10))
@@ -75,8 +78,12 @@ def inner_start(
         step = -scale * solve(scaled, (scale * gradient)[:, None])[:, 0]
         fall = -gradient @ step
         ahead = theta + step / (1.0 + jnp.sqrt(jnp.maximum(fall, 0.0) / weight))
-        # With a small weight, rounding may spoil a step; the current point is then accurate enough.
-        return jnp.where(jnp.all(jnp.isfinite(ahead)) & (fall > 0), ahead, theta), fall / weight
+        # With a small weight, rounding may spoil a step, or lead it out of the set; the current point is then
+        # accurate enough.
+        farther = ahead + _MARGIN * (ahead - start)
+        within = jnp.all(jnp.isfinite(jax.vmap(log_cholesky)(farther[places])))
+        sound = jnp.all(jnp.isfinite(ahead)) & (fall > 0) & within
+        return jnp.where(sound, ahead, theta), fall / weight
 
     def cost(theta: Array) -> Array:
         e = columns @ theta + rest
