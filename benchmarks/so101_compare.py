@@ -29,6 +29,8 @@ ROWS = 1001
 def run(joint: int, logs: dict[str, np.ndarray]) -> dict[str, Any]:
     """Compare the motions of one joint, 1-based, in which it moves; return the record."""
     case: dict[str, Any] = {**case_of(), "fit": []}
+    # The base, to which the others are compared, is the motion that moves the joint most.
+    logs = dict(sorted(logs.items(), key=lambda item: -float(np.std(np.diff(item[1][f"q{joint}"])))))
     with tempfile.TemporaryDirectory() as folder:
         for name, motion in logs.items():
             first = FITTED.get(name, 0)

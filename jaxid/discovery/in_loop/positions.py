@@ -7,7 +7,7 @@ what the fitted parameters could do in its place is projected off by the search,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -39,6 +39,8 @@ _COLUMNS = 4
 _SPRUNG, _TURN = 4, 0.25
 # Number of times that noise and starts are estimated, and the unknowns refitted.
 _RENEWALS = 2
+# Delays beside that of a fit from which it is tried again, in rows of the log.
+_DELAYS = (-1.0, -0.5, -0.25, 0.25, 0.5, 1.0)
 # Part of the motion that integration leaves wrong in any model.
 NUMERICS = 1e-5
 
@@ -357,17 +359,27 @@ class LoopSearch(Search):
 
     Args:
         positions, logs: Those of `LoopAcceptance`.
+        coarse: Function of a model that returns values of its unknowns from which fits start, beside those
+            of the model: an incomplete model fits best in another valley than a complete one.
     """
 
     positions: PositionDomain | None = None
     logs: tuple[Loops, ...] = ()
+    coarse: Callable[[Model], list[np.ndarray]] = lambda model: []
 
     def _acceptance(self) -> Acceptance:
         shared = (self.superset, self.data, self.validation, self.floor, self.colour)
         return LoopAcceptance(*shared, positions=self.positions, logs=self.logs)
 
     def renewed(self, model: Model) -> Model:
-        """Return a model refitted with the noise of the encoder and the starts as they are beside it."""
+        """Return a model refitted from many starts, with the noise of the encoder as it is beside it."""
+        index = self.fitted_by(model.added)
+        fits = [model.theta]
+        for values in self.coarse(model) if model.added else []:
+            theta = model.theta.copy()
+            theta[index] = values
+            fits.append(self.fit(theta, index))
+        model = replace(model, theta=min(fits, key=self.acceptance.squares))
         for _ in range(_RENEWALS):
             renewed: list[Loops] = []
             for samples in self.logs:
@@ -376,8 +388,28 @@ class LoopSearch(Search):
             self.logs = tuple(renewed)
             self.samples, *others = self.logs
             self.acceptance.samples, self.acceptance.others = self.samples, others
-            model = replace(model, theta=self.fit(model.theta, self.fitted_by(model.added)))
+            theta = self.fit(model.theta, index)
+            others = self._at_other_delays(theta, index) if model.added else []
+            model = replace(model, theta=min([theta, *others], key=self.acceptance.squares))
         return model
+
+    def _at_other_delays(self, theta: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
+        """Return fits from other delays about that of a fit.
+
+        A command that is held from row to row, or has quantised readings beside it, leaves the cost several
+        minima along the delay, about a row apart.
+        """
+        free = self.superset.machine.parameters.free
+        row = float(self.samples.parts[0].log.period)
+        out = []
+        for k in (k for k in index if free[k].path[-1] == "delay"):
+            for step in _DELAYS:
+                if theta[k] + step * row > 0:
+                    at = theta.copy()
+                    at[k] += step * row
+                    # The others first: together with them it would return to where it came from.
+                    out.append(self.fit(self.fit(at, index[index != k]), index))
+        return out
 
     def drawn_noise(self, model: Model, runs: int) -> Float[np.ndarray, "runs time n"] | None:
         """Draw residuals of the fitted logs by the noise in their loops; None if it is not known of one."""

@@ -15,14 +15,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.discovery.candidates import View
-from jaxid.discovery.final import final_machine
+from jaxid.discovery.final import final_machine, machine_with
 from jaxid.discovery.in_loop.positions import JoinedLoops, Loops, LoopSamples, LoopSearch, PositionDomain
 from jaxid.discovery.result import Discovery, Round
-from jaxid.discovery.search import Step
+from jaxid.discovery.search import Model, Step
 from jaxid.discovery.superset import build_candidate_model
 from jaxid.discovery.where import Where
 from jaxid.errors import InputError
 from jaxid.estimators import steps_of
+from jaxid.estimators.coarse_starts import coarse_starts
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import parts_of
@@ -150,6 +151,15 @@ def _search(session: Session, machine: Machine, progress: Callable[[str], None])
             view = View.of(superset.machine, run.own, scale if run in session.fits else np.ones_like(scale))
         return LoopSamples.of(run, machine, superset, choose_numerics(at_fit, run.log), view)
 
+    declared = {f.name: f.guess for f in session.machine.parameters.free}
+
+    def coarse(model: Model) -> list[np.ndarray]:
+        theta = model.theta.copy()
+        theta[superset.base] = [declared[name] for name in machine.parameters.names]
+        alone = machine_with(machine, superset, model.added, theta)[0]
+        parts = parts_of(session.with_machine(alone))
+        return coarse_starts(alone, parts, [choose_numerics(part.machine, part.log) for part in parts])
+
     fits = [samples(run) for run in session.fits]
     return LoopSearch(
         superset,
@@ -163,6 +173,7 @@ def _search(session: Session, machine: Machine, progress: Callable[[str], None])
             JoinedLoops.of(fits) if len(fits) > 1 else fits[0],
             *[samples(run) for run in session.validations],
         ),
+        coarse=coarse,
     )
 
 
