@@ -47,6 +47,7 @@ def run(joint: int, logs: dict[str, np.ndarray]) -> dict[str, Any]:
         seconds = time.perf_counter() - begin
     return {
         "joint": joint,
+        "commit": commit_of(HERE.parents[1]),
         "verdict": result.verdict,
         "why": result.why,
         "differences": [
@@ -80,7 +81,8 @@ def table(content: dict[str, Any]) -> str:
     lines = [
         "# SO-101's motions among themselves",
         "",
-        f"Written by `python -m benchmarks.so101_compare` on {content['date']}, at {content['commit']}.",
+        f"Written by `python -m benchmarks.so101_compare` on {content['date']}, at "
+        f"{', '.join(sorted({r['commit'] for r in content['joints']}))}.",
         f"{ROWS} rows of each motion in which the joint moves. One arm made all of them; in",
         f"{' and '.join(TOUCHING)} it touches the table, which the model of a joint does not know.",
         "",
@@ -121,7 +123,7 @@ def main() -> None:
         record = run(joint, logs)
         content = json.loads(kept.read_text()) if kept.exists() else {"joints": []}
         content["joints"] = [r for r in content["joints"] if r["joint"] != joint] + [record]
-        content |= {"commit": commit_of(HERE.parents[1]), "date": date.today().isoformat()}
+        content["date"] = date.today().isoformat()
         kept.write_text(json.dumps(content, indent=1) + "\n")
         (args.o / "so101_compare.md").write_text(table(content))
         print(table(content), flush=True)
