@@ -1,5 +1,6 @@
 """What logs of a loop without a force lack, found in the simulated loop; logs by the exact stepper."""
 
+import dataclasses
 import json
 import tomllib
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from benchmarks.unforced_machines import command_of, servo
 from jaxid.errors import InputError
 from tests.estimators.test_unforced import CASE, DELAY, FREE, TRUE, log
 from truth.axis.machines import Setup, moves, multisine
@@ -69,11 +71,6 @@ def test_a_missing_delay_is_named_and_put_into_the_controller(tmp_path):
     case = d.case()
     assert case.controller.unknown["delay"].guess == pytest.approx(delay.value)
     assert not any(e.cls.kind == "command_delay" for e in case.effects)
-
-
-def test_two_logs_are_refused():
-    with pytest.raises(InputError, match="discover without a force takes one log, not 2"):
-        jaxid.discover(tomllib.loads(CASE), [log(), log(seed=1)])
 
 
 def test_an_effect_on_the_command_has_no_place_in_a_search_with_a_force():
@@ -144,3 +141,24 @@ def test_another_log_confirms_or_refuses():
     assert confirmed.kinds == ["coulomb_friction"]
     assert confirmed.rounds[-1].position_validation[0] < 6e-4
     assert DELAY == pytest.approx(confirmed.parameters["controller.delay"].value, abs=1e-3)
+
+
+@pytest.mark.slow
+def test_two_logs_are_searched_together():
+    """The declared model fits both best with another delay, from which no fit of the true one comes back."""
+    first = servo(5, "unbalance")
+    command = command_of(np.random.default_rng([77, 5]), first.rate, first.every, 905)
+    second = dataclasses.replace(first, seed=905, command=command)
+    d = jaxid.discover(first.case(), [first.columns(), second.columns()])
+    assert (d.verdict, d.kinds) == ("found", ["unbalance"])
+    for name, true in (
+        ("unbalance.phase", first.effects["unbalance"]["phase"]),
+        ("controller.delay", first.effects["command_delay"]["delay"]),
+    ):
+        found = d.parameters[name]
+        assert abs(found.value - true) < 4 * found.std, name
+    # Nothing gives a scale, and the values of a force are relative to the inertia.
+    moment = d.after.details["relative"]["values"]["unbalance.moment"]
+    true = first.effects["unbalance"]["moment"] / first.inertia
+    assert abs(moment["value"] - true) < 4 * moment["std"]
+    assert d.where.text.startswith("log ")
