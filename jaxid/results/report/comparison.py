@@ -34,7 +34,7 @@ def comparison_report(result: Comparison) -> str:
             name = f"{gap.name}, joint {joint + 1}" if several else gap.name
             words = f"{name}: unexplained {quantity} over time"
             draw = lambda size, gap=gap, joint=joint: plot_gap(
-                gap, int(joint), (quantity, units[joint]), size, named=bool(result.differences)
+                gap, int(joint), units[joint], size, named=bool(result.differences)
             )
             residuals.append((name, with_narrow(image(draw(_WIDE), words), draw(_NARROW))))
 
@@ -86,20 +86,17 @@ def plot_values(result: Comparison) -> Figure:
     return figure
 
 
-def plot_gap(
-    gap: LogGap, joint: int, signal: tuple[str, str], size: tuple[float, float], *, named: bool
-) -> Figure:
+def plot_gap(gap: LogGap, joint: int, unit: str, size: tuple[float, float], *, named: bool) -> Figure:
     """Draw the unexplained force or position of one joint of one log over time.
 
     Args:
         gap: The log.
         joint: The joint, 0-based.
-        signal: What was compared, and its unit.
+        unit: Unit of what was compared.
         size: Width and height [inch].
         named: Whether differences were found, so that there are two residuals.
     """
     figure, ax, _ = time_axes(size, 1, (1, 1))
-    quantity, unit = signal
     factor, label = scaled_unit(unit, [gap.before[:, joint]])
     lines = [("one machine", BEFORE, gap.before), ("with what differs", AFTER, gap.after)]
     for name, colour, residual in lines if named else lines[:1]:
@@ -107,7 +104,7 @@ def plot_gap(
         curve = envelope(gap.time[shown], residual[shown, joint] / factor, bucket_count(size))
         ax.plot(*curve, color=colour, lw=0.9, label=name)
     ax.axhline(0.0, color=TEXT, lw=0.6, zorder=0)
-    dress(ax, "time [s]", f"unexplained {quantity} [{label}]")
+    dress(ax, "time [s]", f"unexplained [{label}]")
     legend(ax)
     return figure
 
