@@ -79,7 +79,7 @@ class JointFlexibility(Effect):
     gap: Array | None = parameter("position", "positive", "total clearance in series with it", optional=True)
 
     def act(self, x: Signals, state: Array) -> Action:
-        w = jnp.sqrt(self.stiffness / self.load_inertia)
+        w = jnp.sqrt(jnp.divide(self.stiffness, self.load_inertia))
         e, ed = state[0] / w, state[1]
         pull = self.stiffness * e + self.damping * ed
         if self.gap is not None:
