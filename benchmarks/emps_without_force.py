@@ -166,13 +166,13 @@ def table(content: dict[str, Any]) -> str:
         records = [r for r in content["records"] if r["by_direction"] == by_direction]
         names = [n for n in UNITS if n in records[0]["parameters"]]
         title = "Viscous friction by direction, a fifth unknown:" if by_direction else "The published model:"
-        lines += [title, "", "| | " + " | ".join(f"{n} [{UNITS[n]}]" for n in names) + " | s |"]
-        lines.append("|---" * (len(names) + 2) + "|")
+        lines += [title, "", "| | " + " | ".join(f"{n} [{UNITS[n]}]" for n in names) + " |"]
+        lines.append("|---" * (len(names) + 1) + "|")
         rows = records if by_direction else [*records, published()]
         for r in rows:
             p = r["parameters"]
             cells = " | ".join(f"{p[n]['value']:.2f} ± {p[n]['std']:.2f}" for n in names)
-            lines.append(f"| {r['name']} | {cells} | {r.get('seconds', '')} |")
+            lines.append(f"| {r['name']} | {cells} |")
         lines += ["", "*No force* less the others, in % of theirs and in σ of *no force*:", ""]
         lines += ["| | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
         for r in rows[1:]:

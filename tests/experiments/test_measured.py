@@ -89,6 +89,26 @@ def test_output_error_sees_the_hold_that_the_published_recipe_does_not(emps):
     assert -0.03 < off["coulomb_friction.level"] < -0.015
 
 
+@pytest.mark.slow
+@needs_data
+def test_emps_without_its_force_gives_the_values_that_use_it(emps):
+    """Gains give the scale; inverse dynamics with the hold aligned says what the force tells."""
+    recipe = (emps / "emps_recipe.toml").read_text()
+    aligned = emps / "aligned_beside.toml"
+    aligned.write_text(recipe.replace("trim = 50", "trim = 50\nalign_hold = true"))
+    log = emps / "DATA_EMPS.mat"
+    seen = jaxid.identify(aligned, log, method="inverse_dynamics")
+    blind = jaxid.identify(emps / "emps_no_force.toml", log)
+    assert blind.session.fit.log.passive
+    assert blind.converged
+    for name, value in {**PUBLISHED, "constant_force.level": 3.165}.items():
+        found = blind.parameters[name]
+        assert found.value == pytest.approx(seen.value(name), rel=0.02), name
+        assert abs(found.value - value) < 1.96 * found.std, name
+    _, pulses = blind.gaps
+    assert pulses.simulation.relative[0] <= 1.5e-5
+
+
 @needs_data
 def test_the_chosen_method_agrees_with_the_published_values_of_emps(emps):
     result = jaxid.identify(emps / "emps_recipe.toml", emps / "DATA_EMPS.mat")
