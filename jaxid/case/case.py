@@ -166,6 +166,11 @@ class Case:
         return self.base if self.path is None else self.path.parent
 
     @property
+    def without_force(self) -> bool:
+        """True if the logs hold what a controller follows, and no force."""
+        return self.controller is not None and self.log is not None and self.log.force is None
+
+    @property
     def true_reference(self) -> dict[str, Any] | None:
         """[reference] for a simulation: with the true values of its unknowns, if it has any."""
         if self.reference is None:

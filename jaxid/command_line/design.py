@@ -13,9 +13,15 @@ from jaxid.command_line.parser import Commands, add_long_command
 def add(commands: Commands) -> None:
     """Add the command and its arguments."""
     purpose = "find the reference or input within [limits] whose log identifies the unknowns best"
-    examples = "jaxid design case.toml -o reference.csv"
+    examples = "jaxid design case.toml -o reference.csv\njaxid design no_force.toml log.csv -o reference.csv"
     parser = add_long_command(commands, "design", purpose, run, examples=examples)
     parser.add_argument("case", metavar="CASE.toml", help="the case, with [simulation]")
+    parser.add_argument(
+        "log",
+        metavar="LOG",
+        nargs="*",
+        help="logs without a force that there are: they are fitted first, and the experiment adds to them",
+    )
     parser.add_argument("-o", metavar="SIGNAL.csv", required=True, help="file to write the signal to")
 
 
@@ -25,10 +31,19 @@ def run(args: argparse.Namespace) -> int:
 
     path = ready_file(Path(args.o), overwrite=args.force)
     need_sound_case(args)
+    from jaxid.case.case import load_case
+
+    case = path.with_suffix(".toml") if load_case(args.case).without_force else None
+    if case is not None:
+        ready_file(case, overwrite=args.force, suffix=".toml")
     with progress_of(args) as show:
         from jaxid.commands.design import design
+        from jaxid.experiment_design.unforced import UnforcedDesign
 
-        found = design(args.case, progress=show)
+        found = design(args.case, args.log or None, progress=show)
     found.save(path)
     print(f"{found}\n{len(found.time)} ticks of the {found.signal} in {path}")
+    if isinstance(found, UnforcedDesign):
+        found.save_case(path)
+        print(f"case of the fit in {case}: record the logs that [[fit]] names there")
     return 0

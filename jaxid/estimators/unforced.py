@@ -103,22 +103,39 @@ def scale_group(machine: Machine, log: Log) -> tuple[int, ...]:
         log: The log, for its positions.
     """
     law = machine.controller
-    names = next((names for kind, names in _GAINS.items() if type(law) is kind), None)
+    names = _gains(machine)
     if names is None or machine.disturbance is not None:
         # Another law is not linear in its gains, and a disturbance is a known force.
         return ()
     free = machine.parameters.free
-    unknown = {f.path[1] for f in free if f.path[0] == CONTROLLER}
-    stated = [n for n in names if n not in unknown and np.any(np.asarray(getattr(law, n)) != 0)]
+    unknown = _of_controller(machine)
+    known = stated_gains(machine)
     if law is None or (law.limit is not None and "limit" not in unknown):
-        stated.append("limit")
+        known.append("limit")
     forces = without_scale(machine, log)
-    if stated or not forces:
+    if known or not forces:
         return ()
     gains = {*names, "limit"} & unknown
     return tuple(
         k for k, f in enumerate(free) if f.name in forces or f.path[0] == CONTROLLER and f.path[1] in gains
     )
+
+
+def stated_gains(machine: Machine) -> list[str]:
+    """Return the keys of the gains that a case states as numbers, other than zero."""
+    unknown = _of_controller(machine)
+    names = _gains(machine) or ()
+    return [n for n in names if n not in unknown and np.any(np.asarray(getattr(machine.controller, n)) != 0)]
+
+
+def _gains(machine: Machine) -> tuple[str, ...] | None:
+    """Return the keys that give the command of a machine's law a scale; None for a law of another kind."""
+    return next((names for kind, names in _GAINS.items() if type(machine.controller) is kind), None)
+
+
+def _of_controller(machine: Machine) -> set[str | int]:
+    """Return the keys of the unknowns of the controller."""
+    return {f.path[1] for f in machine.parameters.free if f.path[0] == CONTROLLER}
 
 
 def base_of(machine: Machine, group: tuple[int, ...]) -> int:

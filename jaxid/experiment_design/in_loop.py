@@ -36,7 +36,7 @@ from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import Replay, with_sensor
 
 # Relative width of the guesses if the case states none.
-_PRIOR = 0.5
+PRIOR = 0.5
 # A tour reaches its speed within this part of the stroke; sines go up to this part of the rate.
 _RUN_UP, _FASTEST = 0.02, 0.1
 # Number of most informative starts that are improved, and evaluations for each.
@@ -49,7 +49,7 @@ _STERN = 100.0
 # Integration steps between two ticks at most: more of them cost time, and the design does not improve.
 _STEPS = 8
 # Sharpness at which an experiment is designed: friction that sticks exactly has no gradient in the reference.
-_SHARPNESS = 0.1
+SHARPNESS = 0.1
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,31 @@ def design_in_loop(case: Case, progress: Callable[[str], None]) -> Design:
     Raises:
         InputError: If no experiment keeps within the limits.
     """
-    problem = _DesignProblem.of(case)
+    problem = LoopDesign.of(case)
+    signals = informative_signals(problem, case.where, progress)
+    progress("computing the expected precision of each")
+    return problem.designed(signals)
+
+
+def informative_signals(
+    problem: LoopDesign,
+    where: str,
+    progress: Callable[[str], None],
+    most: int = _IMPROVED,
+    evaluations: int = _EVALUATIONS,
+) -> list[Float[np.ndarray, "ticks m"]]:
+    """Return signals within the limits: those from which the search starts, and those that it ends with.
+
+    Args:
+        problem: The design.
+        where: The case, for messages.
+        progress: Called with a line of text at every stage.
+        most: Number of most informative starts that are improved.
+        evaluations: Largest number of evaluations for each of them.
+
+    Raises:
+        InputError: If no experiment keeps within the limits.
+    """
     progress("evaluating sines and tours")
 
     def both(p: np.ndarray) -> tuple[float, np.ndarray]:
@@ -128,25 +152,25 @@ def design_in_loop(case: Case, progress: Callable[[str], None]) -> Design:
     if not starts:
         raise InputError(
             "no experiment within the limits was found",
-            where=f"{case.where}, [limits]",
+            where=f"{where}, [limits]",
             hint="widen them, or check the loop's gains: every trial exceeded them, whatever its amplitude",
         )
 
     values = [both(p) for p in starts]
-    ranked = sorted(range(len(starts)), key=lambda k: values[k][0])[:_IMPROVED]
+    ranked = sorted(range(len(starts)), key=lambda k: values[k][0])[:most]
     optima = []
     for k in ranked:
         progress("improving the most informative")
-        optima.append(improved(both, starts[k], values[k], _EVALUATIONS)[1])
-
-    progress("computing the expected precision of each")
+        optima.append(improved(both, starts[k], values[k], evaluations)[1])
     kept = [p for p in (*starts, *map(problem.within, optima)) if p is not None]
-    return problem.designed([problem.shapes.signal(p) for p in kept])
+    return [problem.shapes.signal(p) for p in kept]
 
 
 @dataclass(frozen=True)
-class _DesignProblem:
+class LoopDesign:
     """Machine, noise, prior and family of signals of a design.
+
+    A signal of fewer rows than the loop has ticks is held for `replay.every` ticks.
 
     Args:
         machine: The machine at the guesses.
@@ -158,6 +182,7 @@ class _DesignProblem:
         limits: Limits of the experiment.
         shapes: Family of signals.
         starts: Numbers of the signals from which a design starts.
+        known: Information without the experiment, in units of the prior, (p, p); None: that of the prior.
     """
 
     machine: Machine
@@ -169,26 +194,27 @@ class _DesignProblem:
     limits: Limits
     shapes: Shapes
     starts: list[np.ndarray]
+    known: np.ndarray | None = None
 
     @classmethod
-    def of(cls, case: Case) -> _DesignProblem:
+    def of(cls, case: Case) -> LoopDesign:
         rate, duration = sampling_of(case)
         machine = build_machine(case, period=1 / rate)
-        limits = _limits(case, machine)
+        limits = limits_of(case, machine)
         period = machine.hold_period or 1 / rate
         every = max(1, round(1 / (rate * period)))
         ticks = (round(duration * rate) - 1) * every + 1
         speed = float(limits.speed.max())
-        plant = machine.plant.smoothed(np.asarray(_SHARPNESS), np.asarray(speed))
+        plant = machine.plant.smoothed(np.asarray(SHARPNESS), np.asarray(speed))
         machine = machine.with_plant(plant, machine.parameters)
-        shapes, starts = _family(machine, limits, ticks, period)
+        shapes, starts = family(machine, limits, ticks, period)
 
         start = np.broadcast_to(case.simulation.initial_position, case.plant.joints)
         refuse_impossible(plant, start[None], f"{case.where}, [simulation] initial_position")
-        width = _PRIOR if case.within_prior is None else case.within_prior.prior
+        width = PRIOR if case.within_prior is None else case.within_prior.prior
         problem = cls(
             machine=machine,
-            replay=_empty_replay(machine, start, ticks, period, every),
+            replay=empty_replay(machine, start, ticks, period, every),
             weight=np.zeros(0),
             direct_share=np.zeros(0),
             prior=Prior.of(machine, width, np.zeros(0)),
@@ -205,11 +231,11 @@ class _DesignProblem:
     def run(self, signal: Array, sensor: Sensor | None = None) -> Replay:
         """Return the run of the machine under a signal."""
         replay = self.replay if sensor is None else with_sensor(self.replay, sensor)
-        return _replayed_under(replay, self.machine.plant, jnp.asarray(signal))
+        return replayed_under(replay, self.machine.plant, jnp.asarray(signal))
 
     def peaks(self, signal: np.ndarray) -> Peaks:
         """Return the extremes of the motion under a signal."""
-        run = _trajectory(self.run(signal), self.machine.plant)
+        run = _trajectory(at_every_tick(self.run(signal)), self.machine.plant)
         return Peaks.of(*(np.asarray(x) for x in (run.position, run.velocity, run.command)))
 
     def within(self, p: np.ndarray) -> np.ndarray | None:
@@ -223,7 +249,7 @@ class _DesignProblem:
         If readings are quantised, it is that of a log simulated at the guesses: see `fit_with_quantisation`.
         """
         problem = Problem(
-            replay=_replayed_under(self.replay, self.machine.plant, jnp.asarray(signal)),
+            replay=replayed_under(self.replay, self.machine.plant, jnp.asarray(signal)),
             places=self.machine.parameters.places,
             plant=self.machine.plant,
             measured=np.zeros(self.weight.shape),
@@ -268,7 +294,9 @@ class _DesignProblem:
         return np.where(self.prior.log, 1.0, 1.0 / np.abs(self.prior.base)) * self.prior.scale
 
 
-def _empty_replay(machine: Machine, start: np.ndarray, ticks: int, period: float, every: int) -> Replay:
+def empty_replay(
+    machine: Machine, start: np.ndarray, ticks: int, period: float, every: int, longest_delay: int = 0
+) -> Replay:
     """Build the run of a machine from rest, with a signal of zeros.
 
     Args:
@@ -277,6 +305,7 @@ def _empty_replay(machine: Machine, start: np.ndarray, ticks: int, period: float
         ticks: Number of ticks of the signal.
         period: Time between ticks [s].
         every: Number of ticks in a sample of the log.
+        longest_delay: Ticks of past command that are kept for delays.
     """
     n, m = start.size, machine.gain.size
     none = np.zeros((ticks, m))
@@ -286,7 +315,7 @@ def _empty_replay(machine: Machine, start: np.ndarray, ticks: int, period: float
     # cost of limits keeps it within.
     if controller is not None and controller.limit is not None:
         controller = replace(controller, limit=_BEYOND * jnp.asarray(controller.limit))
-    drive = Drive(machine.gain, period, "zero_order", 1, True)
+    drive = Drive(machine.gain, period, "zero_order", 1, True, longest_delay)
     replay = Replay(
         drive=drive,
         controller=controller,
@@ -305,7 +334,7 @@ def _empty_replay(machine: Machine, start: np.ndarray, ticks: int, period: float
     return replace(replay, drive=replace(drive, substeps=min(steps, _STEPS)))
 
 
-def _limits(case: Case, machine: Machine) -> Limits:
+def limits_of(case: Case, machine: Machine) -> Limits:
     """Take the limits that a case states; a force that is not stated follows from the controller's limit."""
     table, n, m = case.limits, case.plant.joints, machine.gain.size
     if machine.controller is None and table.force is None:
@@ -324,8 +353,18 @@ def _limits(case: Case, machine: Machine) -> Limits:
     )
 
 
-def _family(machine: Machine, limits: Limits, ticks: int, period: float) -> tuple[Shapes, list[np.ndarray]]:
-    """Build the family of signals within the limits, and the starts of the search: the tour first."""
+def family(
+    machine: Machine, limits: Limits, ticks: int, period: float, acceleration: np.ndarray | None = None
+) -> tuple[Shapes, list[np.ndarray]]:
+    """Build the family of signals within the limits, and the starts of the search: the tour first.
+
+    Args:
+        machine: The machine.
+        limits: Limits of the experiment.
+        ticks: Number of values of a signal.
+        period: Time between two of them [s].
+        acceleration: Largest acceleration of a reference by drive, (m,); None: no limit.
+    """
     speed, looped = float(limits.speed.max()), machine.controller is not None
     if looped:
         ends = (limits.low, limits.high, limits.speed * period)
@@ -336,27 +375,28 @@ def _family(machine: Machine, limits: Limits, ticks: int, period: float) -> tupl
     stroke = float((high - low).max())
     pace = speed if looped else 20 * stroke / (ticks * period)
     hardest = pace**2 / (_RUN_UP * stroke)
+    if acceleration is not None:
+        hardest = min(hardest, float(acceleration.max()))
     fastest = min(hardest / (2 * np.pi * pace), _FASTEST / period)
     functions, weights = basis(ticks, period, fastest, (stroke, pace, hardest), None)
-    shapes = Shapes.within(functions, low, high, step)
+    curve = None if acceleration is None else acceleration * period**2
+    shapes = Shapes.within(functions, low, high, step, curve)
     return shapes, [shapes.numbers(w) for w in weights]
 
 
-def _noise_levels(
-    case: Case, problem: _DesignProblem
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+def _noise_levels(case: Case, problem: LoopDesign) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Compute the noise of each compared column, without and with rounding that passes through the loop."""
     sensor, n, m = problem.machine.sensor, case.plant.joints, problem.machine.gain.size
     std: list[np.ndarray] = []
     through_loop = np.zeros(0)
     if problem.on in ("position", "both"):
         if sensor.position_std is None:
-            raise _no_noise(case, "position", "position_noise or position_resolution")
+            raise no_noise(case, "position", "position_noise or position_resolution")
         std.append(np.broadcast_to(np.asarray(sensor.position_std), n))
         through_loop = np.zeros(n)
     if problem.on in ("force", "both"):
         if sensor.force_noise is None:
-            raise _no_noise(case, "force", "force_noise")
+            raise no_noise(case, "force", "force_noise")
         force_noise = np.broadcast_to(np.asarray(sensor.force_noise), m)
         std.append(np.abs(problem.machine.gain) * force_noise)
 
@@ -370,7 +410,7 @@ def _noise_levels(
     return direct, np.hypot(direct, through_loop)
 
 
-def _no_noise(case: Case, what: str, key: str) -> InputError:
+def no_noise(case: Case, what: str, key: str) -> InputError:
     """Build the error of a case whose noise is not stated."""
     return InputError(
         f"the noise of the {what} is not known",
@@ -379,13 +419,22 @@ def _no_noise(case: Case, what: str, key: str) -> InputError:
     )
 
 
-def _replayed_under(replay: Replay, plant: Plant, signal: Array) -> Replay:
+def replayed_under(replay: Replay, plant: Plant, signal: Array) -> Replay:
     """Return a run under a signal, from rest at its first value if it is a loop."""
     if replay.controller is None:
         return replace(replay, command=signal)
+    assert replay.disturbance is not None, "a loop has one, which may be zero"
+    ticks = replay.disturbance.shape[0]
+    if signal.shape[0] < ticks:
+        signal = jnp.repeat(signal, replay.every, axis=0)[:ticks]
     start = jnp.asarray(replay.position)
     driven = jnp.asarray(plant.driven(start.size))
     return replace(replay, reference=signal, position=start.at[driven].set(signal[0]))
+
+
+def at_every_tick(replay: Replay) -> Replay:
+    """Return a run with a row for every tick: a joint may be fastest between the rows of a log."""
+    return replace(replay, every=1)
 
 
 _trajectory = eqx.filter_jit(lambda replay, plant: replay(plant))
@@ -397,7 +446,7 @@ def _sensitivity(
     """Differentiate the compared quantities over their noise, in units of the prior, (rows, p)."""
     p, none = len(places), jnp.zeros(weight.shape)
     compared = WeightedResidual(
-        replay=_replayed_under(replay, plant, signal),
+        replay=replayed_under(replay, plant, signal),
         places=places,
         plant=plant,
         measured=none,
@@ -417,24 +466,30 @@ def _information(*args: Any) -> Array:
 
 
 @eqx.filter_jit
-def _loss(p: Array, args: tuple, shapes: Shapes, bounds: LimitCost) -> tuple[Array, Array]:
+def _loss(
+    p: Array, args: tuple, shapes: Shapes, bounds: LimitCost, known: Array | None
+) -> tuple[Array, Array]:
     """Compute minus the information gained [nats] plus the cost of the limits, and the gradient."""
     replay, places, plant, weight, prior, on = args
 
     def of(p: Array) -> tuple[Array, Array]:
         signal = shapes(p)
         j = _sensitivity(replay, places, plant, weight, prior, on, signal)
-        gained = 0.5 * jnp.linalg.slogdet(jnp.eye(j.shape[1]) + j.T @ j)[1]
+        before = jnp.eye(j.shape[1]) if known is None else known
+        gained = 0.5 * jnp.linalg.slogdet(before + j.T @ j)[1]
         here = scatter(places, plant, prior.base)
-        value = -gained + _STERN * bounds.cost(_replayed_under(replay, plant, signal)(here))
+        whole = at_every_tick(replayed_under(replay, plant, signal))(here)
+        value = -gained + _STERN * bounds.cost(whole)
         return value, value
 
     slope, value = jax.jacfwd(of, has_aux=True)(p)
     return value, slope
 
 
-def _value_and_slope(problem: _DesignProblem, p: np.ndarray) -> tuple[float, np.ndarray]:
+def _value_and_slope(problem: LoopDesign, p: np.ndarray) -> tuple[float, np.ndarray]:
     """Evaluate the loss of some numbers; a run that diverged gets the worst value and no direction."""
-    value, slope = _loss(jnp.asarray(p), problem.args(), problem.shapes, LimitCost.of(problem.limits))
+    value, slope = _loss(
+        jnp.asarray(p), problem.args(), problem.shapes, LimitCost.of(problem.limits), problem.known
+    )
     good = np.isfinite(value) & np.all(np.isfinite(slope))
     return (float(value), np.asarray(slope)) if good else (1e6, np.zeros_like(p))

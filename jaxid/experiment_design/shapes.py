@@ -36,21 +36,29 @@ class Shapes(eqx.Module):
         basis: Functions from rest at zero and back to it, of largest magnitude one, (time, k).
         low, high: Range of the signal, (n,).
         step: Largest change from sample to sample, (n,); infinite without a limit.
+        curve: Largest change of that change, (n,); None: no limit.
     """
 
     basis: Float[Array, "time k"]
     low: Float[Array, " n"]
     high: Float[Array, " n"]
     step: Float[Array, " n"]
+    curve: Float[Array, " n"] | None = None
 
     @classmethod
     def within(
-        cls, basis: Float[np.ndarray, "time k"], low: np.ndarray, high: np.ndarray, step: np.ndarray
+        cls,
+        basis: Float[np.ndarray, "time k"],
+        low: np.ndarray,
+        high: np.ndarray,
+        step: np.ndarray,
+        curve: np.ndarray | None = None,
     ) -> Shapes:
         """Build a family with room for the overshoot of a loop."""
         room = 0.5 * _ROOM * (high - low)
         values = (basis, low + room, high - room, (1 - _ROOM) * step)
-        return cls(*(jnp.asarray(v, dtype=float) for v in values))
+        bend = None if curve is None else jnp.asarray((1 - _ROOM) * curve, dtype=float)
+        return cls(*(jnp.asarray(v, dtype=float) for v in values), bend)
 
     def __call__(self, p: Float[Array, " p"]) -> Float[Array, "time n"]:
         """Return the signal of some numbers: weights by joint, then centres, then the amplitude."""
@@ -59,8 +67,11 @@ class Shapes(eqx.Module):
         half = 0.5 * (self.high - self.low)
         centre = self.low + half * (1 + _CENTRE * jnp.tanh(p[n * k : n * k + n]))
         steps = jnp.diff(x, axis=0) / self.step
-        needs = jnp.concatenate([x / (self.high - centre), -x / (centre - self.low), steps, -steps])
-        scale = 1.0 / largest(needs)
+        needs = [x / (self.high - centre), -x / (centre - self.low), steps, -steps]
+        if self.curve is not None:
+            bends = jnp.diff(x, n=2, axis=0) / self.curve
+            needs += [bends, -bends]
+        scale = 1.0 / largest(jnp.concatenate(needs))
         return centre + jax.nn.sigmoid(p[-1]) * scale * x
 
     def signal(self, p: Float[np.ndarray, " p"]) -> Float[np.ndarray, "time n"]:

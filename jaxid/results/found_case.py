@@ -235,6 +235,19 @@ def case_text(result: FitResult, folder: Path) -> str:
     return tomlkit.dumps(wanted)
 
 
+def text_of_case(case: Case, folder: Path) -> str:
+    """Return a case as TOML as it was given, its file names from another folder.
+
+    Raises:
+        InputError: If the case has been changed in Python since its file was read.
+    """
+    import tomlkit
+
+    document = tomlkit.parse(_text(case))
+    _rename_in(document, _renamer(case.folder, folder))
+    return tomlkit.dumps(document)
+
+
 def save_found_case(result: FitResult, path: Path, *, overwrite: bool = False) -> Path:
     """Write the case with the results; see `FitResult.save_case`."""
     if path.is_dir() or not path.parent.is_dir():

@@ -5,7 +5,7 @@ import pytest
 
 import jaxid
 from jaxid.cli import main
-from jaxid.experiment_design.in_loop import _DesignProblem
+from jaxid.experiment_design.in_loop import LoopDesign
 from jaxid.logs.log import Log
 from truth.axis.stepper import Loop, Machine, Sensor, simulate
 
@@ -145,7 +145,7 @@ def test_of_a_loop_that_rounding_tosses_about_nothing_is_expected(coarse):
     for count in (COUNT, 200 * COUNT):
         case = path.with_name("tossed.toml")
         case.write_text(path.read_text().replace(f"resolution = {COUNT}", f"resolution = {count}"))
-        told[count] = _DesignProblem.of(jaxid.load_case(case)).expected(design.values)
+        told[count] = LoopDesign.of(jaxid.load_case(case)).expected(design.values)
     assert np.all(np.diag(told[COUNT]) < 0.2)
     np.testing.assert_array_equal(told[200 * COUNT], np.eye(3))
 
