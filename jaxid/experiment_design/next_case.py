@@ -67,7 +67,7 @@ def _added(design: UnforcedDesign, path: Path, tables: Mapping[str, Any]) -> dic
     fits.append({"name": DESIGNED, "log": f"{path.stem}_log.csv"})
     effects: list[dict[str, Any]] = []
     if design.base is not None and design.second:
-        [*_, second] = [s for s in design.second if s.values.keys() == design.second[0].values.keys()]
+        second = design.second[0]
         fits.append({"name": SECOND, "log": f"{path.stem}_second_log.csv", "set": dict(second.values)})
         if not any(e["kind"] == AddedMass.kind for e in tables.get("effects", [])):
             effects.append({"kind": AddedMass.kind, "mass": 0.0})

@@ -54,6 +54,8 @@ if TYPE_CHECKING:
 _PAYLOADS, _GAINS = (0.25, 1.0), (0.5, 2.0)
 # Number of most informative starts that are improved, and evaluations for each.
 _IMPROVED, _EVALUATIONS = 3, 100
+# Part of a tick by which a delay is moved to either side.
+_BESIDE = 0.01
 # Part by which the rate of the log may differ from a whole part of the loop's.
 _WHOLE = 1e-3
 
@@ -77,8 +79,9 @@ class SecondLog:
 class UnforcedDesign:
     """A reference for a loop whose force is not logged, and the expected precision of its unknowns.
 
-    Deviations are those of white noise on the readings, by the Fisher information of the position. Without a
-    scale, they are those of the ratios to one of the unknowns, which is held.
+    Deviations are those of white noise on the readings, by the Fisher information of the position; the
+    derivative by a delay is that on the side of its tick that tells less. Without a scale, they are those of
+    the ratios to one of the unknowns, which is held.
 
     Args:
         case: The case.
@@ -212,12 +215,16 @@ class UnforcedDesign:
 class _Information:
     """Information of the positions of some logs.
 
+    The position has a kink where an unknown delay is a whole number of ticks, and the two sides of it may
+    tell much or little. The side that tells less counts.
+
     Args:
-        matrix: J'J over the variance of a reading, by the unknowns of all logs, (p, p).
+        matrices: J'J over the variance of a reading, by the unknowns of all logs, on each side of the delays,
+            (2, p, p).
         signal: Squared norm of the positions over the deviation of a reading.
     """
 
-    matrix: Float[np.ndarray, "p p"]
+    matrices: Float[np.ndarray, "2 p p"]
     signal: float
 
     @classmethod
@@ -229,23 +236,37 @@ class _Information:
             noise: Standard deviation of a reading, (n,).
             width: Number of unknowns of all logs.
         """
-        machine, log = part.machine, part.log
-        jacobian = position_jacobian(machine, log, choose_numerics(machine, log))
+        log, numerics = part.log, choose_numerics(part.machine, part.log)
         seen = np.flatnonzero(log.measured)
-        rows = part.widened(jacobian[:, seen] / noise[seen][:, None], width).reshape(-1, width)
+        matrices = []
+        for machine in _beside_ticks(part.machine):
+            jacobian = position_jacobian(machine, log, numerics)[:, seen]
+            rows = part.widened(jacobian / noise[seen][:, None], width).reshape(-1, width)
+            matrices.append(rows.T @ rows)
         moved = (log.filled - log.filled.mean(axis=0))[:, seen] / noise[seen]
-        return cls(rows.T @ rows, float(np.sum(moved**2)))
+        return cls(np.stack(matrices), float(np.sum(moved**2)))
+
+    @classmethod
+    def none(cls, width: int) -> _Information:
+        """Return that of no log."""
+        return cls(np.zeros((2, width, width)), 0.0)
 
     def __add__(self, other: _Information) -> _Information:
-        return _Information(self.matrix + other.matrix, self.signal + other.signal)
+        return _Information(self.matrices + other.matrices, self.signal + other.signal)
+
+    def least(self, machine: Machine, held: Collection[int]) -> Float[np.ndarray, "p p"]:
+        """Return the matrix of the side that tells less, without some unknowns."""
+        kept = [k for k in range(len(machine.parameters.free)) if k not in held]
+        sides = [matrix[np.ix_(kept, kept)] for matrix in self.matrices]
+        return min(sides, key=lambda matrix: _gained(matrix, machine.parameters.guess[kept]))
 
     def std(self, machine: Machine, held: Collection[int]) -> Float[np.ndarray, " p"]:
         """Return the standard deviations if some unknowns are known; NaN for these, and where not told."""
-        unknown = machine.parameters
+        unknown, own = machine.parameters, self.least(machine, held)
         kept = [k for k in range(len(unknown.free)) if k not in held]
-        own, guess = self.matrix[np.ix_(kept, kept)], unknown.guess[kept]
-        names, signal = [unknown.names[k] for k in kept], float(np.sqrt(self.signal))
-        precision = assess_from_sums(names, own, own, signal, np.where(guess != 0, guess, 1.0))
+        guess, names = unknown.guess[kept], [unknown.names[k] for k in kept]
+        size = np.where(guess != 0, guess, 1.0)
+        precision = assess_from_sums(names, own, own, float(np.sqrt(self.signal)), size)
         out = np.full(len(unknown.free), np.nan)
         out[kept] = np.where(precision.identifiable, precision.std, np.nan)
         return out
@@ -292,7 +313,7 @@ def designed_unforced(
     limits = _limits(case, machine)
 
     before = [_Information.of(part, present.noise, width) for part in present.parts]
-    known = _Information(np.zeros((width, width)), 0.0)
+    known = _Information.none(width)
     for one in before:
         known = known + one
     rows = round(duration * rate)
@@ -307,8 +328,8 @@ def designed_unforced(
     progress("computing the expected precision of each")
     parts = [Part.alone(machine, _played(machine, signal, rate)) for signal in signals]
     informed = [known + _Information.of(part, present.noise, width) for part in parts]
-    kept = [k for k in range(width) if k not in held]
-    gained = [_gained(one.matrix[np.ix_(kept, kept)], machine.parameters.guess[kept]) for one in informed]
+    guess = np.delete(machine.parameters.guess, held)
+    gained = [_gained(one.least(machine, held), guess) for one in informed]
     best = int(np.argmax(gained))
 
     progress("trying second logs")
@@ -431,8 +452,7 @@ def _problem(
     memory = choose_numerics(machine, _at_rest(machine, np.zeros((rows, 1)), rate))
     prior = Prior.of(machine, PRIOR, np.zeros(0))
     slope = prior.slope(machine.parameters.guess)
-    kept = [k for k in range(len(known.matrix)) if k != base]
-    matrix = known.matrix[np.ix_(kept, kept)] * np.outer(slope, slope)
+    matrix = known.least(present.machine, () if base is None else (base,)) * np.outer(slope, slope)
     return LoopDesign(
         machine=machine,
         replay=empty_replay(machine, start, (rows - 1) * every + 1, period, every, memory.longest_delay),
@@ -443,7 +463,7 @@ def _problem(
         limits=limits,
         shapes=shapes,
         starts=starts,
-        known=np.eye(len(kept)) + matrix,
+        known=np.eye(len(matrix)) + matrix,
     )
 
 
@@ -485,6 +505,16 @@ def _from_rest(machine: Machine, log: Log) -> Replay:
 @kept_jit
 def _run(replay: Replay, plant: Plant) -> Trajectory:
     return replay(plant)
+
+
+def _beside_ticks(machine: Machine) -> tuple[Machine, Machine]:
+    """Return the machine with its unknown delays a little shorter, and a little longer."""
+    controller, unknown = machine.controller, machine.parameters
+    assert controller is not None, "only a loop is designed"
+    delays = np.array([f.path[0] == CONTROLLER and f.path[1] == "delay" for f in unknown.free], dtype=bool)
+    step = _BESIDE * float(controller.period) * delays
+    shorter = np.where(delays, np.maximum(unknown.guess - step, 0.0), unknown.guess)
+    return machine.with_estimate(shorter), machine.with_estimate(unknown.guess + step)
 
 
 def _gained(matrix: Float[np.ndarray, "p p"], guess: Float[np.ndarray, " p"]) -> float:
