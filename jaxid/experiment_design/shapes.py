@@ -56,9 +56,10 @@ class Shapes(eqx.Module):
     ) -> Shapes:
         """Build a family with room for the overshoot of a loop."""
         room = 0.5 * _ROOM * (high - low)
-        values = (basis, low + room, high - room, (1 - _ROOM) * step)
         bend = None if curve is None else jnp.asarray((1 - _ROOM) * curve, dtype=float)
-        return cls(*(jnp.asarray(v, dtype=float) for v in values), bend)
+        values = (basis, low + room, high - room, (1 - _ROOM) * step)
+        functions, least, most, pace = (jnp.asarray(v, dtype=float) for v in values)
+        return cls(functions, least, most, pace, bend)
 
     def __call__(self, p: Float[Array, " p"]) -> Float[Array, "time n"]:
         """Return the signal of some numbers: weights by joint, then centres, then the amplitude."""
