@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +28,9 @@ from jaxid.model.plant import Plant
 from jaxid.numerics.affine import depends
 from jaxid.numerics.lanes import accelerator
 from jaxid.numerics.smooth import ramp
+from jaxid.numerics.tangents import varying
+
+T = TypeVar("T")
 
 # Gauss-Seidel sweeps; chosen: 20 converge to rounding on six joints.
 _SWEEPS = 20
@@ -113,30 +115,55 @@ def set_valued_step(
     if here.rises or depends(levels_at, (x.q, x.qd)):
         return direct()
 
-    def rolled() -> tuple[State, Array]:
-        def once(reaction: Array, _: None) -> tuple[Array, tuple[State, _Answer, Array]]:
-            after = flow(x, reaction)
-            answer = action(after)
-            return spread(answer.reaction, ports, none.size), (after, answer, reaction)
-
-        # The step without friction and that with it as a loop: two copies of an arm compile twice as long.
-        _, (after, answer, reaction) = jax.lax.scan(once, none, length=2)
-        first, last = (functools.partial(_entry, k) for k in range(2))
-        return under(first(answer), last(after), last(reaction))
-
     # Nearly all steps only drag. No level depends on the motion, so that the step under this reaction can be
     # taken first; the other steps, and their derivatives, belong to a branch that few samples take.
     before = _port_speed(plant, x, ports)
-    reaction = spread(-jnp.sign(before) * picked(here.dry, ports), ports, none.size)
-    dragged = flow(x, reaction)
-    after = _port_speed(plant, dragged, ports)
-    # Where a port nears its reversal, the general case decides whether it is within the step.
-    goes_on = jnp.all((before * after > 0.0) & (jnp.abs(after - before) <= jnp.abs(after)))
-    return _unless(goes_on, (dragged, reaction), rolled if plant.coupled else direct)
+    drag = spread(-jnp.sign(before) * picked(here.dry, ports), ports, none.size)
+
+    def goes_on(dragged: State) -> Array:
+        """Check that no port nears its reversal, which the general case decides on."""
+        after = _port_speed(plant, dragged, ports)
+        return jnp.all((before * after > 0.0) & (jnp.abs(after - before) <= jnp.abs(after)))
+
+    if not plant.coupled:
+        dragged = flow(x, drag)
+        return _unless(goes_on(dragged), (dragged, drag), direct)
+
+    def once(trial: _Trial, k: Array) -> tuple[_Trial, None]:
+        def tried() -> _Trial:
+            after = flow(x, trial.reaction)
+            drags = (k == 0) & goes_on(after)
+            answer = _only_if(k == 1, lambda: action(after), trial.answer)
+            without = jnp.where(drags, drag, none)
+            reaction = jnp.where(k == 0, without, spread(answer.reaction, ports, none.size))
+            new = _Trial(trial.done | drags, after, reaction, answer)
+            return jax.tree.map(lambda old, new: jnp.where(trial.done, old, new), trial, new)
+
+        return _only_if(~_in_all_lanes(trial.done), tried, trial), None
+
+    # The step that drags, that without friction and that under the answer as a loop: three copies of an arm
+    # compile three times as long.
+    zeros = varying(jnp.zeros(len(ports)), x.qd)
+    no = jnp.zeros(len(ports), bool)
+    first = _Trial(jnp.zeros((), bool), x, varying(drag, x.qd), _Answer(zeros, no, no, 1.0 + zeros))
+    end, _ = jax.lax.scan(once, first, jnp.arange(3))
+    return under(end.answer, end.after, end.reaction)
 
 
-def _entry(k: int, tree: Any) -> Any:
-    return jax.tree.map(lambda a: a[k], tree)
+class _Trial(NamedTuple):
+    """A step under a reaction of dry friction.
+
+    Args:
+        done: Whether that is the reaction of the step.
+        after: The state after the step.
+        reaction: The reaction of the next step to try; once done, of this one.
+        answer: Action of friction over the step; without an effect if it only drags.
+    """
+
+    done: Array
+    after: State
+    reaction: Array
+    answer: _Answer
 
 
 def _unless(done: Array, answer: tuple[State, Array], general: Callable[[], tuple]) -> tuple[State, Array]:
@@ -145,8 +172,14 @@ def _unless(done: Array, answer: tuple[State, Array], general: Callable[[], tupl
     def otherwise() -> tuple[State, Array]:
         return jax.tree.map(lambda a, b: jnp.where(done, a, b), answer, general())
 
-    # An accelerator would wait for the host to choose a branch.
-    return otherwise() if accelerator() else jax.lax.cond(_in_all_lanes(done), lambda: answer, otherwise)
+    return _only_if(~_in_all_lanes(done), otherwise, answer)
+
+
+def _only_if(flag: Array, function: Callable[[], T], otherwise: T) -> T:
+    """Return the result of a function if a flag is set, else another value, without the function."""
+    if accelerator():  # it would wait for the host to choose a branch
+        return jax.tree.map(lambda a, b: jnp.where(flag, a, b), function(), otherwise)
+    return jax.lax.cond(flag, function, lambda: otherwise)
 
 
 @jax.custom_batching.custom_vmap
@@ -350,8 +383,8 @@ def _shared_reaction(mobility: Array, speed: Array, before: Array, dry: Array, h
         entries = _own_reaction(own[i], remaining, before[i], dry[i], hold[i])
         return _Answer(*(a.at[i].set(entry) for a, entry in zip(at, entries, strict=True))), None
 
-    no = jnp.zeros(n, bool)
-    start = _Answer(jnp.zeros(n), no, no, jnp.ones(n))
+    no, zeros = jnp.zeros(n, bool), varying(jnp.zeros(n), speed)
+    start = _Answer(zeros, no, no, 1.0 + zeros)
     # A loop, not a copy for each port and sweep: those of six joints took a minute and a half to compile.
     return jax.lax.scan(one, start, jnp.tile(jnp.arange(n), _SWEEPS))[0]
 

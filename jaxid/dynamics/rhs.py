@@ -23,6 +23,7 @@ from jaxid.model.balance import Balance
 from jaxid.model.plant import Plant
 from jaxid.numerics.affine import Affine, affine
 from jaxid.numerics.smooth import ramp, sign
+from jaxid.numerics.tangents import varying
 
 # Traced once for all uses in a step: tracing takes most of the time until a first result.
 balance_of = eqx.filter_jit(lambda plant, *args: plant.balance(*args))
@@ -95,6 +96,8 @@ def acceleration(
         t: Time from the start of the log [s].
         reaction: Dry-friction force by port from a set-valued step; absent: smoothed.
     """
+    if plant.coupled and reaction is not None:
+        return _coupled_acceleration(plant, x, u, t, reaction)
     mass, rest = _mass_and_rest(plant, x, u, t, reaction)
     if reaction is not None or not rest.rises:
         if plant.coupled:
@@ -342,7 +345,7 @@ def _rolled(slope: Callable[..., Array], x: State, h: Array, parts: Array, force
         a = slope(q, v, part, u)
         return (v, a, q_sum + weight * v, v_sum + weight * a), None
 
-    zero = jnp.zeros_like(x.q)
+    zero = varying(jnp.zeros_like(x.qd), x.qd)
     weights = jnp.asarray([1.0, 2.0, 2.0, 1.0])
     (_, _, q, v), _ = jax.lax.scan(stage, (x.qd, zero, zero, zero), (parts, weights, forces))
     return State(x.q + h / 6 * q, x.qd + h / 6 * v, x.own)

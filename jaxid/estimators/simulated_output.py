@@ -18,6 +18,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.kept import kept_jit
+from jaxid.numerics.tangents import varying
 from jaxid.simulation.loops import Drive, needed_substeps
 from jaxid.simulation.replay import (
     LONGEST_MEMORY,
@@ -61,7 +62,9 @@ def output_residual(
     def residual(theta: Array) -> Array:
         extra = theta[len(places) :]
         nudge = extra if extra.size else None
-        run = replay.following(places, theta)(scatter(places, plant, theta), nudge, noise)
+        start = varying((jnp.asarray(replay.position), jnp.asarray(replay.velocity)), theta)
+        begun = eqx.tree_at(lambda r: (r.position, r.velocity), replay, start)
+        run = begun.following(places, theta)(scatter(places, plant, theta), nudge, noise)
         outputs: dict[str, tuple[Array, ...]] = {
             "position": (run.position,),
             "velocity": (run.velocity,),
