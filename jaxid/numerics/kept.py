@@ -48,33 +48,46 @@ class _Array:
 def kept_jit(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a function as `equinox.filter_jit` does, and keep its code if there is a folder for it.
 
+    It is compiled in least time, unless it is a part of another compiled function.
+
     Args:
         function: Function of trees of arrays, defined in a module of jaxid; it returns such a tree.
     """
-    plain = eqx.filter_jit(function)
+    plain, quick = eqx.filter_jit(function), functools.cache(lambda: _quick(function))
     calls: dict[bytes, Callable[[list], T] | None] = {}
     locks: dict[bytes, threading.Lock] = {}
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        if FOLDER not in os.environ:
-            return plain(*args, **kwargs)
         leaves, structure = jax.tree.flatten((args, kwargs))
         arrays = [x for x in leaves if isinstance(x, _ARRAYS)]
         if any(isinstance(x, Tracer) for x in arrays):
+            # Its code is a part of another function's, with the options of that one.
             return plain(*args, **kwargs)
+        if FOLDER not in os.environ:
+            return (plain if _tracing() else quick())(*args, **kwargs)
         static = jax.tree.unflatten(structure, [_Array if isinstance(x, _ARRAYS) else x for x in leaves])
         key = _key(function, static, arrays)
         if key is None:
-            return plain(*args, **kwargs)
+            return quick()(*args, **kwargs)
         # Two threads may ask for one function at once: the second waits for the first.
         with locks.setdefault(key, threading.Lock()):
             if key not in calls:
                 calls[key] = _ready(function, structure, leaves, arrays, key)
         compiled = calls[key]
-        return plain(*args, **kwargs) if compiled is None else compiled([np.asarray(x) for x in arrays])
+        return quick()(*args, **kwargs) if compiled is None else compiled([np.asarray(x) for x in arrays])
 
     return call
+
+
+def _tracing() -> bool:
+    """Check that this runs while another function is traced."""
+    return isinstance(jnp.zeros(()), Tracer)
+
+
+def _quick(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a function in least time; see `jaxid.numerics.lanes.quick_to_compile`."""
+    return eqx.filter_jit(function, compiler_options=quick_to_compile())
 
 
 def _key(function: Callable, static: Any, arrays: list) -> bytes | None:
