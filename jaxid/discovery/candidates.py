@@ -6,9 +6,10 @@ would take longer than the whole search.
 
 from __future__ import annotations
 
+import functools
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,14 +22,24 @@ from jaxid.arrays import Array
 from jaxid.discovery.bounded_fit import bounded_fit
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
+from jaxid.model.balance import BarePlant
 from jaxid.model.effect import Effect
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, Parameters, scatter, seeds
+from jaxid.numerics.affine import Dependence, dependences
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import in_threads
 from jaxid.own_values import OwnValues
-from jaxid.simulation.force_balance import ForceData, force_and_columns, force_residual, scale_columns
+from jaxid.simulation.force_balance import (
+    ForceData,
+    Linearised,
+    bare_plant,
+    force_linearised,
+    force_residual,
+    inertial_columns,
+    knows_bare_plant,
+)
 
 # A candidate with more starts than this is evaluated on a plant without other effects, all starts at once.
 _FEW = 8
@@ -135,6 +146,23 @@ class CandidateModel:
         """Vector of unknowns at which only the baseline acts."""
         return self.machine.parameters.guess
 
+    @functools.cached_property
+    def own(self) -> np.ndarray:
+        """Indices of the unknowns that belong to the plant itself, and to no effect."""
+        return np.flatnonzero([f.effect is None for f in self.machine.parameters.free])
+
+    @functools.cached_property
+    def own_enter(self) -> Dependence | None:
+        """How the inertial forces depend on these; None if anything else does too, such as the ports."""
+        plant, free = without_effects(self.machine.plant), self.machine.parameters.free
+        if not len(self.own):
+            return Dependence.CONSTANT
+        places = tuple((free[k].path, free[k].index) for k in self.own)
+        motion = plant.any_motion(np.random.default_rng(20240501))
+        bare = lambda theta: BarePlant.of(scatter(places, plant, theta), *motion)
+        inertial, *others = dependences(bare, (self.neutral[self.own],))
+        return None if plant.geared or any(others) else inertial
+
 
 @dataclass(frozen=True)
 class View:
@@ -206,7 +234,8 @@ class View:
         return out * self.scale[:, None]
 
 
-class Viewed(NamedTuple):
+@dataclass(frozen=True)
+class Viewed:
     """A log or a piece of one, and its view of the superset.
 
     Args:
@@ -216,6 +245,92 @@ class Viewed(NamedTuple):
 
     data: ForceData
     view: View | None
+    _bare: OrderedDict[tuple, _Bare] = field(default_factory=OrderedDict, repr=False, compare=False)
+
+    def superset(self, superset: CandidateModel) -> CandidateModel:
+        """Return the superset as this log has it."""
+        return superset if self.view is None else self.view.superset(superset)
+
+    def theta(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """Return all unknowns as they hold in this log."""
+        return theta if self.view is None else self.view.theta(theta)
+
+    def noisier(self, force_noise: np.ndarray) -> Viewed:
+        """Return the log with a second draw of force noise added, which leaves its motion as it is."""
+        return replace(self, data=_noisier(self.data, force_noise))
+
+    def bare(self, superset: CandidateModel, theta: Float[np.ndarray, " p"]) -> _Bare | None:
+        """Return what the plant does here without its effects; None if that is not known beside them.
+
+        It is computed once, since effects are added to it and fitted, but leave it as it is.
+
+        Args:
+            superset: Machine with all candidates.
+            theta: All unknowns as they hold in this log.
+        """
+        own = self.superset(superset)
+        if not knows_bare_plant(own.machine.plant, self.data):
+            return None
+        key = (id(superset), theta[superset.own].tobytes())
+        if key not in self._bare:
+            kept = next((b for b in self._bare.values() if b.superset is superset), None)
+            self._bare[key] = _Bare.of(superset, own, self.data, theta, kept)
+        self._bare.move_to_end(key)
+        while len(self._bare) > _POINTS:
+            self._bare.popitem(last=False)
+        return self._bare[key]
+
+
+@dataclass(frozen=True)
+class _Bare:
+    """The plant without effects along a log, at some values of its own unknowns.
+
+    Args:
+        superset: The superset that it belongs to; it is kept, so that no other one gets its identity.
+        along: The part of the balance that is the plant's.
+        columns: Derivatives of the filtered inertial forces by the plant's own unknowns, (kept, n, own); None
+            if these enter anything else too.
+    """
+
+    superset: CandidateModel
+    along: BarePlant
+    columns: np.ndarray | None
+
+    @classmethod
+    def of(
+        cls,
+        superset: CandidateModel,
+        own: CandidateModel,
+        data: ForceData,
+        theta: np.ndarray,
+        kept: _Bare | None,
+    ) -> _Bare:
+        """Compute it for a log.
+
+        Args:
+            superset, own: Machine with all candidates, and as this log has it.
+            data: Arrays of the log.
+            theta: All unknowns as they hold in this log.
+            kept: The same at other values; derivatives that do not depend on the values are taken from it.
+        """
+        free, values = own.machine.parameters.free, theta[superset.own]
+        places = tuple((free[k].path, free[k].index) for k in superset.own)
+        plant = scatter(places, without_effects(own.machine.plant), values)
+        along = bare_plant(plant, data)
+        assert along is not None, "asked of logs that determine it"
+        enter, columns = superset.own_enter, None
+        if not len(values):
+            columns = np.zeros((*data.weight.shape, 0))
+        elif kept is not None and enter is not Dependence.OTHER:
+            columns = kept.columns
+        elif enter is not None:
+            columns = np.asarray(inertial_columns(plant, places, data, jnp.asarray(values)))
+        return cls(superset, along, columns)
+
+
+def without_effects(plant: Plant) -> Plant:
+    """Return a plant without its effects."""
+    return eqx.tree_at(lambda p: p.effects, plant, ())
 
 
 class CandidateSamples:
@@ -240,11 +355,7 @@ class CandidateSamples:
         cut = [(part, own) for log, own in logs for part in log.parts(most, _PIECES)]
         self.parts = [part for part, _ in cut]
         self.arrays = [Viewed(ForceData.of(part), own) for part, own in cut]
-        self.noisier = (
-            []
-            if force_noise is None
-            else [Viewed(_noisier(a.data, force_noise), a.view) for a in self.arrays]
-        )
+        self.noisier = [] if force_noise is None else [a.noisier(force_noise) for a in self.arrays]
         moving = [p.moving.copy() for p in self.parts]
         for m in moving[1:]:
             m[0] = False  # a piece does not continue the one before it
@@ -254,8 +365,8 @@ class CandidateSamples:
 
     def evaluated(
         self, superset: CandidateModel, theta: Float[np.ndarray, " p"], wanted: frozenset[int]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return residual and Jacobian as `evaluate` does, from a recent call if one had the same columns."""
+    ) -> _Rows:
+        """Return residual and derivatives, from a recent call if one had the same columns."""
         key = (id(superset), theta.tobytes())
         point = self._latest.setdefault(key, _Point(superset, {}))
         self._latest.move_to_end(key)
@@ -263,18 +374,34 @@ class CandidateSamples:
             self._latest.popitem(last=False)
         found = next((known for asked, known in point.known.items() if wanted <= asked), None)
         if found is None:
-            found = point.known[wanted] = evaluate_on(superset, self.arrays, theta, sorted(wanted))
+            found = point.known[wanted] = _rows(superset, self.arrays, theta, sorted(wanted))
         return found
 
 
+class _Rows(NamedTuple):
+    """Residual of the superset along logs, one after the other, and its derivatives.
+
+    Args:
+        residual: The residual, (kept, n).
+        jacobian: Its derivatives by all unknowns of the superset, (kept, n, p).
+        scales: Derivatives of the logarithm of the drives' ratio, of each log, (n, p).
+        lengths: Number of rows of each log.
+    """
+
+    residual: np.ndarray
+    jacobian: np.ndarray
+    scales: list[np.ndarray]
+    lengths: list[int]
+
+
 class _Point(NamedTuple):
-    """Evaluations at one point of a superset: residual and Jacobian, by the unknowns of its columns.
+    """Evaluations at one point of a superset, by the unknowns of their columns.
 
     The superset is kept, so that no other one gets its identity.
     """
 
     superset: CandidateModel
-    known: dict[frozenset[int], tuple[np.ndarray, np.ndarray]]
+    known: dict[frozenset[int], _Rows]
 
 
 def _noisier(arrays: ForceData, force_noise: np.ndarray) -> ForceData:
@@ -298,7 +425,8 @@ def evaluate(
         wanted: Indices of the unknowns that need derivatives; columns of others may be zero. None: all.
     """
     asked = range(len(theta)) if wanted is None else np.asarray(wanted, int).tolist()
-    return samples.evaluated(superset, theta, frozenset(asked))
+    found = samples.evaluated(superset, theta, frozenset(asked))
+    return found.residual, found.jacobian
 
 
 def evaluate_on(
@@ -308,46 +436,107 @@ def evaluate_on(
     wanted: Sequence[int] | np.ndarray | None = None,
 ) -> tuple[Float[np.ndarray, "kept n"], Float[np.ndarray, "kept n p"]]:
     """Compute residual and Jacobian, as `evaluate` does, on several logs or pieces, one after the other."""
+    found = _rows(superset, logs, theta, wanted)
+    return found.residual, found.jacobian
+
+
+def _rows(
+    superset: CandidateModel,
+    logs: Sequence[Viewed],
+    theta: Float[np.ndarray, " p"],
+    wanted: Sequence[int] | np.ndarray | None,
+) -> _Rows:
+    """Compute residual and derivatives on several logs or pieces; arguments are those of `evaluate_on`."""
     colours = np.asarray(superset.colours, int)
-    directions = seeds(superset.colours)
     views = [log.view for log in logs]
     if wanted is not None:
         wanted = [k for view in views for k in (wanted if view is None else view.wanted(wanted))]
-    # The choice of directions is data: with a fixed number of columns one compiled function serves all.
     ask = np.unique(colours if wanted is None else colours[np.asarray(wanted, int)])
-    parts = [ask[k : k + _COLUMNS] for k in range(0, max(len(ask), 1), _COLUMNS)]
-    calls = []
-    for log in logs:
-        own = superset if log.view is None else log.view.superset(superset)
-        at = theta if log.view is None else log.view.theta(theta)
-        calls += [(own, log.data, at, directions, part) for part in parts]
-    results = in_threads(_directional_derivatives, calls)
+    jobs = [_Evaluation.of(superset, log, log.theta(theta), ask) for log in logs]
+    results = iter(in_threads(_directional_derivatives, [call for job in jobs for call in job.calls]))
 
-    by_log = [results[k : k + len(parts)] for k in range(0, len(results), len(parts))]
-    scales = [1.0 if view is None else view.scale for view in views]
-    e = np.concatenate([some[0][0] * scale for some, scale in zip(by_log, scales, strict=True)])
-    derivatives = np.concatenate([np.concatenate([c for _, c in some], axis=-1) for some in by_log])
-    jacobian = np.zeros((*e.shape, directions.shape[1]))
-    jacobian[..., ask] = derivatives
-    # From colours to unknowns: an unknown has the column of its colour, in the balances that it enters.
-    jacobian = jacobian[..., colours]
-    jacobian = jacobian if directions.shape[1] == len(theta) else jacobian * superset.enters
-    if not any(views):
-        return e, jacobian
-    ends = np.cumsum([len(some[0][0]) for some in by_log])[:-1]
-    rows = zip(np.split(jacobian, ends), views, strict=True)
-    return e, np.concatenate([part if view is None else view.jacobian(part) for part, view in rows])
+    residuals, jacobians, scales = [], [], []
+    for job, log in zip(jobs, logs, strict=True):
+        e, jacobian, slopes = job.joined([next(results) for _ in job.calls])
+        residuals.append(e if log.view is None else e * log.view.scale)
+        jacobians.append(jacobian if log.view is None else log.view.jacobian(jacobian))
+        scales.append(slopes)
+    lengths = [len(e) for e in residuals]
+    return _Rows(np.concatenate(residuals), np.concatenate(jacobians), scales, lengths)
+
+
+@dataclass(frozen=True)
+class _Evaluation:
+    """Calls of compiled code that evaluate a superset along one log.
+
+    Args:
+        superset: Machine with all candidates.
+        bare: The plant without effects along the log; None: not known beside them.
+        parts: Colours of the columns of each call.
+        calls: Arguments of each call.
+        kept: Whether the columns of the plant's own unknowns are those of `bare`.
+    """
+
+    superset: CandidateModel
+    bare: _Bare | None
+    parts: list[np.ndarray]
+    calls: list[tuple]
+    kept: bool
+
+    @classmethod
+    def of(cls, superset: CandidateModel, log: Viewed, theta: np.ndarray, ask: np.ndarray) -> _Evaluation:
+        """Prepare the evaluation of some colours, at the unknowns as they hold in the log."""
+        bare, directions = log.bare(superset, theta), seeds(superset.colours)
+        own = np.unique(np.asarray(superset.colours, int)[superset.own])
+        in_plant = np.isin(ask, own) if bare is not None else np.zeros(len(ask), bool)
+        kept = bare is not None and bare.columns is not None
+        # No effect is in the plant alone, and no unknown of the plant is in the effects.
+        beside = _blocks(ask[~in_plant]) or ([] if in_plant.any() and not kept else [ask[:0]])
+        within = [] if kept else _blocks(ask[in_plant])
+        known = None if bare is None else bare.along
+        machine = log.superset(superset).machine
+        calls = [(machine, log.data, theta, directions, part, known) for part in beside]
+        calls += [(machine, log.data, theta, directions, part, None) for part in within]
+        return cls(superset, bare, [*beside, *within], calls, kept)
+
+    def joined(self, results: Sequence[Linearised]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return residual, Jacobian and slopes of the drives' ratio by all unknowns, from the calls."""
+        first, superset = results[0], self.superset
+        by_colour = np.zeros((*first.residual.shape, max(superset.colours, default=-1) + 1))
+        slopes = np.zeros((len(first.ratio), by_colour.shape[-1]))
+        for part, found in zip(self.parts, results, strict=True):
+            by_colour[..., part], slopes[:, part] = found.columns, found.slopes
+        # From colours to unknowns: an unknown has the column of its colour, in the balances that it enters.
+        colours = np.asarray(superset.colours, int)
+        jacobian, slopes = by_colour[..., colours], slopes[:, colours]
+        if by_colour.shape[-1] < len(colours):
+            jacobian, slopes = jacobian * superset.enters, slopes * superset.enters
+        if self.kept:
+            assert self.bare is not None, "only a known plant has kept columns"
+            jacobian[..., superset.own] = self.bare.columns / first.ratio[:, None]
+        return first.residual, jacobian, slopes
+
+
+def _blocks(colours: np.ndarray) -> list[np.ndarray]:
+    """Cut colours into blocks: with a fixed number of columns one compiled function serves all of them."""
+    return [colours[k : k + _COLUMNS] for k in range(0, len(colours), _COLUMNS)]
 
 
 def _directional_derivatives(
-    superset: CandidateModel, log: ForceData, theta: np.ndarray, directions: np.ndarray, part: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    machine: Machine,
+    log: ForceData,
+    theta: np.ndarray,
+    directions: np.ndarray,
+    part: np.ndarray,
+    bare: BarePlant | None,
+) -> Linearised:
     """Compute the residual and its derivatives in some directions, padded to a fixed number of them."""
     padded = np.zeros((len(theta), _COLUMNS))
     padded[:, : len(part)] = directions[:, part]
-    plant, places = superset.machine.plant, superset.machine.parameters.places
-    e, columns = force_and_columns(plant, places, log, jnp.asarray(theta), padded)
-    return np.asarray(e), np.asarray(columns)[..., : len(part)]
+    places = machine.parameters.places
+    found = force_linearised(machine.plant, places, log, jnp.asarray(theta), padded, bare)
+    e, columns, ratio, slopes = (np.asarray(a) for a in found)
+    return Linearised(e, columns[..., : len(part)], ratio, slopes[:, : len(part)])
 
 
 def refine(
@@ -433,41 +622,37 @@ def points(
                     shift[:, joints] = (e - residual)[:, joints]
                 if group is not faint:
                     # At a neutral start, as of a gain, only the ratio keeps zeros from solving the balance.
-                    scale = _changes_of_scale(superset, data.arrays, at, c.index)
+                    scale = _changes_of_scale(superset, data, at, c.index)
                     unscaled = jacobian[..., c.index] + e[..., None] * scale
                 results.append(Point(c, k, shift, jacobian[..., c.index], unscaled))
     return results
 
 
 def _changes_of_scale(
-    superset: CandidateModel, logs: Sequence[Viewed], theta: Float[np.ndarray, " p"], index: np.ndarray
+    superset: CandidateModel, samples: CandidateSamples, theta: Float[np.ndarray, " p"], index: np.ndarray
 ) -> Float[np.ndarray, "kept n k"]:
     """Compute the derivatives of the logarithm of the drives' ratio in some unknowns, for every sample."""
-    directions = np.eye(len(theta))[:, index]
-    parts = []
-    for log in logs:
-        own = superset if log.view is None else log.view.superset(superset)
-        at = theta if log.view is None else log.view.theta(theta)
-        machine = own.machine
-        slopes = scale_columns(
-            machine.plant, machine.parameters.places, log.data, jnp.asarray(at), directions
-        )
-        parts.append(np.broadcast_to(np.asarray(slopes), (len(log.data.weight), *slopes.shape)))
-    return np.concatenate(parts)
+    found = samples.evaluated(superset, theta, frozenset(index.tolist()))
+    parts = zip(found.scales, found.lengths, strict=True)
+    return np.concatenate([np.repeat(slopes[None, :, index], rows, axis=0) for slopes, rows in parts])
 
 
 def grid_points(superset: CandidateModel, candidate: Candidate, data: CandidateSamples) -> list[Point]:
     """Linearise a candidate with many starts at each of them, on a plant without other effects."""
     effect: Effect = superset.machine.plant.effects[position(superset, candidate)]
-    alone = eqx.tree_at(lambda p: p.effects, superset.machine.plant, (effect,))
+    alone = without_effects(superset.machine.plant).with_effect(effect)
     names = user_effect_names(effect)
     places = tuple((("effects", 0, n), None) for n in names)
     probes = np.stack([candidate.probe(k) for k in range(len(candidate.starts))])
     results = []
-    for arrays, view in data.arrays:
-        chunks = [np.asarray(_columns(alone, places, arrays, jnp.asarray(s))) for s in _chunks(probes)]
+    for log in data.arrays:
+        known = log.bare(superset, log.theta(superset.neutral))
+        bare = None if known is None else known.along
+        chunks = [
+            np.asarray(_columns(alone, places, log.data, jnp.asarray(s), bare)) for s in _chunks(probes)
+        ]
         columns = np.concatenate(chunks)[: len(candidate.starts)]
-        results.append(columns if view is None else columns * view.scale[:, None])
+        results.append(columns if log.view is None else columns * log.view.scale[:, None])
     columns = np.concatenate(results, axis=1)
     zero = np.zeros(columns.shape[1:3])
     return [Point(candidate, k, zero, c) for k, c in enumerate(columns)]
@@ -482,9 +667,9 @@ def _chunks(starts: np.ndarray, size: int = 37) -> Iterator[np.ndarray]:
 
 
 @kept_jit
-def _columns(plant: Plant, places: tuple, data: ForceData, starts: Array) -> Array:
+def _columns(plant: Plant, places: tuple, data: ForceData, starts: Array, bare: BarePlant | None) -> Array:
     def columns(start: Array) -> Array:
-        return jax.jacfwd(lambda s: force_residual(scatter(places, plant, s), data))(start)
+        return jax.jacfwd(lambda s: force_residual(scatter(places, plant, s), data, bare))(start)
 
     return jax.lax.map(columns, starts)
 

@@ -9,19 +9,51 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.dynamics.rhs import balance_of, phi
+from jaxid.dynamics.rhs import phi
+from jaxid.model.balance import Balance, BarePlant, balance
 from jaxid.model.effect import Effect, Signals
 from jaxid.model.plant import Plant
 from jaxid.numerics.affine import depends
 
 
+# Traced once for all uses along a motion: tracing takes most of the time until a first result.
+@eqx.filter_jit
+def _balance_of(plant: Plant, bare: BarePlant | None, *now: Any) -> Balance:
+    """Compute the balance at one instant, with smoothed dry friction."""
+    return plant.balance(*now) if bare is None else balance(plant, *now, None, bare)
+
+
+def bare_along(plant: Plant, q: Array, qd: Array, qdd: Array) -> BarePlant | None:
+    """Compute what the plant without its effects does along a motion, (time, ...).
+
+    None if its joints are not coupled, or if it has a balance of its own: the whole balance is then computed
+    for all samples at once.
+
+    Args:
+        plant: The plant; its effects do not matter.
+        q, qd, qdd: Motion, (time, n).
+    """
+    if not plant.coupled or type(plant).balance is not Plant.balance:
+        return None
+    # Along a batch the recursion over links runs through memory: it takes six times as long.
+    return jax.lax.map(lambda now: BarePlant.of(plant, *now), (q, qd, qdd))
+
+
 def integrate_internal_states(
-    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array | float, start: Array | float = 0.0
+    plant: Plant,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    u: Array,
+    period: Array | float,
+    start: Array | float = 0.0,
+    bare: BarePlant | None = None,
 ) -> tuple:
     """Integrate the effects' internal states along a measured motion.
 
@@ -35,6 +67,7 @@ def integrate_internal_states(
         u: Declared force at the samples, delay applied, (time, m).
         period: Sampling time [s].
         start: Time of the first sample [s].
+        bare: The plant without effects along the motion, as `bare_along` gives it; None: not known.
 
     Returns:
         The internal states at every sample.
@@ -42,7 +75,7 @@ def integrate_internal_states(
     first = plant.initial_states(u[0])
     if not jax.tree.leaves(first):
         return first
-    motion = (q, qd, qdd, u, start + period * jnp.arange(q.shape[0]))
+    motion = (bare, q, qd, qdd, u, start + period * jnp.arange(q.shape[0]))
     internal = jax.tree.map(lambda z: jnp.broadcast_to(z, (q.shape[0], *jnp.shape(z))), first)
     for wave in _waves(plant, first, u.shape[1]):
         numbers = [i for i in wave if not first[i].ndim]
@@ -102,7 +135,7 @@ def _uses_drive(effect: Effect, state: Array) -> bool:
 def _rates(plant: Plant, motion: tuple, internal: tuple, values: Mapping[int, Any]) -> dict[int, Array]:
     """Return the rates of some internal states along a motion, each state held at a value."""
     at = tuple(jnp.broadcast_to(values[i], z.shape) if i in values else z for i, z in enumerate(internal))
-    return jax.vmap(lambda *now: {i: balance_of(plant, *now).rates[i] for i in values})(*motion, at)
+    return jax.vmap(lambda *now: {i: _balance_of(plant, *now).rates[i] for i in values})(*motion, at)
 
 
 def _slopes(plant: Plant, here: tuple, vectors: list[int], size: int) -> dict[int, Array]:
@@ -111,7 +144,7 @@ def _slopes(plant: Plant, here: tuple, vectors: list[int], size: int) -> dict[in
 
     def rates(shift: Array) -> dict[int, Array]:
         at = tuple(z + shift if i in vectors else z for i, z in enumerate(internal))
-        whole = balance_of(plant, *motion, at).rates
+        whole = _balance_of(plant, *motion, at).rates
         return {i: whole[i] for i in vectors}
 
     return jax.jacfwd(rates)(jnp.zeros(size))
@@ -186,7 +219,14 @@ def _matrix_phi(x: Float[Array, "k k"]) -> list[Array]:
 
 
 def balance_along(
-    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array | float, start: Array | float = 0.0
+    plant: Plant,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    u: Array,
+    period: Array | float,
+    start: Array | float = 0.0,
+    bare: BarePlant | None = None,
 ) -> tuple[Float[Array, "time n"], Float[Array, "time m"]]:
     """Compute the residual of the balance and the force of the drives along a motion, at the load [N or N m].
 
@@ -196,28 +236,37 @@ def balance_along(
         u: Declared force at the samples, delay applied, (time, m).
         period: Sampling time [s].
         start: Time of the first sample [s].
+        bare: The plant without effects along the motion; None: `bare_along` is computed here.
     """
-    internal = integrate_internal_states(plant, q, qd, qdd, u, period, start)
+    bare = bare_along(plant, q, qd, qdd) if bare is None else bare
+    internal = integrate_internal_states(plant, q, qd, qdd, u, period, start, bare)
     times = start + period * jnp.arange(q.shape[0])
 
-    def at(q: Array, qd: Array, qdd: Array, u: Array, t: Array, internal: tuple) -> tuple:
-        balance = balance_of(plant, q, qd, qdd, u, t, internal)
-        return balance.residual, balance.drive
+    def at(*now: Any) -> tuple[Array, Array]:
+        whole = _balance_of(plant, *now)
+        return whole.residual, whole.drive
 
-    if plant.coupled:
-        # Along a batch the recursion over links runs through memory: it takes six times as long.
-        return jax.lax.map(lambda now: at(*now), (q, qd, qdd, u, times, internal))
-    return jax.vmap(at)(q, qd, qdd, u, times, internal)
+    now = (bare, q, qd, qdd, u, times, internal)
+    if bare is None and plant.coupled:
+        return jax.lax.map(lambda now: at(*now), now)
+    return jax.vmap(at)(*now)
 
 
 def residual_along(
-    plant: Plant, q: Array, qd: Array, qdd: Array, u: Array, period: Array | float, start: Array | float = 0.0
+    plant: Plant,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    u: Array,
+    period: Array | float,
+    start: Array | float = 0.0,
+    bare: BarePlant | None = None,
 ) -> Float[Array, "time n"]:
     """Compute inverse dynamics minus declared force, over `drive_ratio` [N or N m, declared units].
 
     Arguments are those of `balance_along`.
     """
-    residual, drive = balance_along(plant, q, qd, qdd, u, period, start)
+    residual, drive = balance_along(plant, q, qd, qdd, u, period, start, bare)
     return residual / drive_ratio(plant, drive, u, q.shape[1])
 
 

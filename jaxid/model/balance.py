@@ -48,48 +48,7 @@ class Balance(eqx.Module):
     rises: tuple[int, ...] = eqx.field(static=True)
 
 
-def balance(
-    plant: Plant,
-    q: Float[Array, " n"],
-    qd: Float[Array, " n"],
-    qdd: Float[Array, " n"],
-    u: Float[Array, " m"],
-    t: Float[Array, ""],
-    states: tuple,
-    reaction: Float[Array, " ports"] | None,
-) -> Balance:
-    """Compute the balance; see `Plant.balance` for the arguments."""
-    port = _PortSignals.of(plant, q, qd, qdd)
-    sums = _Sums.of(plant, port.y.size, u, t)
-
-    for run in group_by_kind(plant.effects, sums.drives):
-        _act(plant, run, port, sums, t, states)
-    _finish_levels(plant, sums)
-
-    rises = _contributed(sums.forth)
-    slides = tuple(sorted({*_contributed(sums.dry), *_contributed(sums.stick), *rises}))
-    at_rest_only, levels = stacked(sums.stick), stacked(sums.dry)
-    rising = jnp.stack([stacked(sums.forth), stacked(sums.back)])
-
-    if reaction is None:
-        reaction = _smoothed_reaction(port, sums, levels, at_rest_only, rising, bool(rises))
-    react = _pull_back(plant, q, stacked(sums.force) + reaction)
-    drive = stacked(sums.drive)
-    residual = plant.inertial(q, qd, qdd) - react - plant.applied(drive, q.size)
-    return Balance(
-        residual=residual,
-        dry=levels,
-        stick=at_rest_only,
-        rising=rising,
-        rates=tuple(sums.rates),
-        drive=drive,
-        slides=slides,
-        rises=rises,
-    )
-
-
-@dataclass
-class _PortSignals:
+class PortSignals(eqx.Module):
     """Motion and surroundings of every port: the signals that effects may use."""
 
     y: Array
@@ -103,7 +62,7 @@ class _PortSignals:
     field: Array
 
     @classmethod
-    def of(cls, plant: Plant, q: Array, qd: Array, qdd: Array) -> _PortSignals:
+    def of(cls, plant: Plant, q: Array, qd: Array, qdd: Array) -> PortSignals:
         motion = port_motion(plant, q, qd, qdd)
         gravity, normal, width = plant.port_gravity(q), plant.port_normal(q), plant.port_width(q)
         return cls(*motion, gravity, normal, width, *plant.port_spring(q), plant.field)
@@ -124,6 +83,80 @@ class _PortSignals:
             damping=self.damping[i],
             field=self.field,
         )
+
+
+class BarePlant(eqx.Module):
+    """The part of a balance that belongs to the plant without its effects, at one instant.
+
+    It is the same whatever the effects are: along a known motion it is computed once for all of them.
+
+    Args:
+        inertial: Inertial forces and weight, by coordinate [N or N m].
+        port: Motion and surroundings of the ports.
+        slope: Derivative of the ports by the coordinates, (ports, n); None: the ports are the joints.
+    """
+
+    inertial: Array
+    port: PortSignals
+    slope: Array | None
+
+    @classmethod
+    def of(cls, plant: Plant, q: Array, qd: Array, qdd: Array) -> BarePlant:
+        """Return it for a plant in motion."""
+        slope = None if plant.ports_are_joints else jax.jacfwd(plant.ports)(q)
+        return cls(plant.inertial(q, qd, qdd), PortSignals.of(plant, q, qd, qdd), slope)
+
+    def pulled_back(self, force: Float[Array, " ports"]) -> Float[Array, " n"]:
+        """Return the generalized force of forces on the ports."""
+        return force if self.slope is None else jnp.sum(self.slope * force[:, None], axis=0)
+
+
+def balance(
+    plant: Plant,
+    q: Float[Array, " n"],
+    qd: Float[Array, " n"],
+    qdd: Float[Array, " n"],
+    u: Float[Array, " m"],
+    t: Float[Array, ""],
+    states: tuple,
+    reaction: Float[Array, " ports"] | None,
+    bare: BarePlant | None = None,
+) -> Balance:
+    """Compute the balance; see `Plant.balance` for the arguments.
+
+    Args:
+        plant, q, qd, qdd, u, t, states, reaction: See there.
+        bare: The plant without effects at this motion, if it is known.
+    """
+    port = PortSignals.of(plant, q, qd, qdd) if bare is None else bare.port
+    sums = _Sums.of(plant, port.y.size, u, t)
+
+    for run in group_by_kind(plant.effects, sums.drives):
+        _act(plant, run, port, sums, t, states)
+    _finish_levels(plant, sums)
+
+    rises = _contributed(sums.forth)
+    slides = tuple(sorted({*_contributed(sums.dry), *_contributed(sums.stick), *rises}))
+    at_rest_only, levels = stacked(sums.stick), stacked(sums.dry)
+    rising = jnp.stack([stacked(sums.forth), stacked(sums.back)])
+
+    if reaction is None:
+        reaction = _smoothed_reaction(port, sums, levels, at_rest_only, rising, bool(rises))
+    force = stacked(sums.force) + reaction
+    react = _pull_back(plant, q, force) if bare is None else bare.pulled_back(force)
+    drive = stacked(sums.drive)
+    inertial = plant.inertial(q, qd, qdd) if bare is None else bare.inertial
+    residual = inertial - react - plant.applied(drive, q.size)
+    return Balance(
+        residual=residual,
+        dry=levels,
+        stick=at_rest_only,
+        rising=rising,
+        rates=tuple(sums.rates),
+        drive=drive,
+        slides=slides,
+        rises=rises,
+    )
 
 
 @dataclass
@@ -173,7 +206,7 @@ class _Sums:
             self.back[i] = self.back[i] + action.rising[1]
 
 
-def _act(plant: Plant, run: list[int], port: _PortSignals, sums: _Sums, t: Array, states: tuple) -> None:
+def _act(plant: Plant, run: list[int], port: PortSignals, sums: _Sums, t: Array, states: tuple) -> None:
     """Compute the actions of a run of effects of one kind in one batch, and add them to the sums."""
     effects = plant.effects
     spots = [(k, i, sums.drives[k]) for k in run for i in plant.directions(effects[k].port)]
@@ -202,7 +235,7 @@ def _finish_levels(plant: Plant, sums: _Sums) -> None:
 
 
 def _smoothed_reaction(
-    port: _PortSignals, sums: _Sums, levels: Array, at_rest_only: Array, rising: Array, rises: bool
+    port: PortSignals, sums: _Sums, levels: Array, at_rest_only: Array, rising: Array, rises: bool
 ) -> Array:
     """Return the force of dry friction by port, with the smoothed sign of the velocity."""
     held = levels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable
 from typing import Any
 
@@ -12,8 +13,14 @@ from jax.extend.core import Jaxpr, Literal, jaxpr_as_fun
 
 from jaxid.arrays import Array
 
-# How a value depends on the arguments: not at all, affinely, or in any other way.
-_CONSTANT, _AFFINE, _OTHER = range(3)
+
+class Dependence(enum.IntEnum):
+    """How a value depends on the arguments: not at all, affinely, or in any other way."""
+
+    CONSTANT, AFFINE, OTHER = range(3)
+
+
+_CONSTANT, _AFFINE, _OTHER = Dependence
 # Entries of a vector up to which its product with a matrix is one sum: the compiler hands larger sums, with
 # many columns, to a matrix library, and a chain of ten masses takes three times as long.
 _MOST_AT_ONCE = 6
@@ -37,6 +44,8 @@ _SUMS = {
     "unstack",
 }
 _FIRST = {"div", "dynamic_slice", "gather"}
+# Operations that run another trace, by the name under which they hold it.
+_INNER = {"jit": "jaxpr", "pjit": "jaxpr", "custom_jvp_call": "call_jaxpr"}
 _PRODUCTS = {"mul", "dot_general"}
 
 
@@ -114,29 +123,33 @@ def is_affine(f: Callable, args: tuple, fixed: tuple = ()) -> bool:
 
 def depends(f: Callable, args: tuple) -> bool:
     """Check that the result of a function depends on its arguments, or may depend on them."""
+    return max(dependences(f, args), default=_CONSTANT) != _CONSTANT
+
+
+def dependences(f: Callable, args: tuple) -> list[Dependence]:
+    """Return how each leaf of a function's result depends on the arguments, as far as its trace proves."""
     closed = jax.make_jaxpr(f)(*jax.tree.map(jnp.zeros_like, args))
-    entering = [_OTHER] * len(jax.tree.leaves(args))
-    return max(_follow(closed.jaxpr, entering), default=_CONSTANT) != _CONSTANT
+    return _follow(closed.jaxpr, [_AFFINE] * len(jax.tree.leaves(args)))
 
 
-def _follow(jaxpr: Jaxpr, entering: list[int]) -> list[int]:
+def _follow(jaxpr: Jaxpr, entering: list[Dependence]) -> list[Dependence]:
     """Return how each output of a trace depends on the arguments."""
     known = dict(zip(jaxpr.invars, entering, strict=True))
 
-    def of(variable: Any) -> int:
+    def of(variable: Any) -> Dependence:
         return _CONSTANT if isinstance(variable, Literal) else known.get(variable, _CONSTANT)
 
     for step in jaxpr.eqns:
         kinds = [of(v) for v in step.invars]
-        inner = step.params.get("jaxpr")
-        if inner is not None and step.primitive.name in ("jit", "pjit"):
+        inner = step.params.get(_INNER.get(step.primitive.name, ""))
+        if inner is not None:
             known.update(zip(step.outvars, _follow(inner.jaxpr, kinds), strict=True))
         else:
             known.update(dict.fromkeys(step.outvars, _after(step, kinds)))
     return [of(v) for v in jaxpr.outvars]
 
 
-def _after(step: Any, kinds: list[int]) -> int:
+def _after(step: Any, kinds: list[Dependence]) -> Dependence:
     """Return the dependence of one operation's result."""
     name, worst = step.primitive.name, max(kinds, default=_CONSTANT)
     if worst == _CONSTANT:
@@ -145,6 +158,8 @@ def _after(step: Any, kinds: list[int]) -> int:
         name in _SUMS
         or (name in _FIRST and max(kinds[1:]) == _CONSTANT)
         or (name in _PRODUCTS and kinds.count(_CONSTANT) == 1)
+        or (name == "scatter" and kinds[1] == _CONSTANT)
+        or (name == "select_n" and kinds[0] == _CONSTANT)
         or (name == "convert_element_type" and step.params["new_dtype"] == jnp.float64)
     )
     return worst if keeps else _OTHER

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,8 +12,9 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array, library
 from jaxid.dynamics.hidden_joints import complete_motion
-from jaxid.dynamics.residuals import balance_along, drive_ratio, residual_along
+from jaxid.dynamics.residuals import balance_along, bare_along, drive_ratio
 from jaxid.logs.prepare import Prepared
+from jaxid.model.balance import BarePlant
 from jaxid.model.drives import Drives
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
@@ -68,18 +71,49 @@ class ForceData(eqx.Module):
         )
 
 
-def force_residual(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:
-    """Return inverse dynamics minus declared force, passed through one filter and decimated [N or N m]."""
+def force_residual(plant: Plant, data: ForceData, bare: BarePlant | None = None) -> Float[Array, "kept n"]:
+    """Return inverse dynamics minus declared force, passed through one filter and decimated [N or N m].
+
+    Args:
+        plant: The plant with its effects.
+        data: Arrays of the prepared log.
+        bare: The plant without effects along the log, as `bare_plant` gives it; None: not known.
+    """
+    return _residual_and_ratio(plant, data, bare)[0]
+
+
+def _residual_and_ratio(
+    plant: Plant, data: ForceData, bare: BarePlant | None
+) -> tuple[Float[Array, "kept n"], Float[Array, " n"]]:
+    """Return the force residual, and the drives' ratio by which it is divided."""
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
     motion = whole_motion(plant, data, u)
-    return data.decimator(residual_along(plant, *motion, u, data.period, data.start))
+    residual, drive = balance_along(plant, *motion, u, data.period, data.start, bare)
+    ratio = drive_ratio(plant, drive, u, data.q.shape[1])
+    return data.decimator(residual / ratio), ratio
 
 
 def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array, Array]:
     """Return position, velocity and acceleration of all joints, with and without encoder, (time, n)."""
     times = data.start + data.period * jnp.arange(data.q.shape[0])
     return complete_motion(plant, data.q, data.qd, data.qdd, u, times, data.measured, data.steps)
+
+
+class Linearised(NamedTuple):
+    """The force residual of a plant at some values of its unknowns, with derivatives in some directions.
+
+    Args:
+        residual: Inverse dynamics minus declared force, over the drives' ratio, (kept, n).
+        columns: Its derivatives, (kept, n, c).
+        ratio: Ratio of the drives, by joint, (n,).
+        slopes: Derivatives of the logarithm of that ratio, (n, c).
+    """
+
+    residual: Array
+    columns: Array
+    ratio: Array
+    slopes: Array
 
 
 @kept_jit
@@ -95,40 +129,74 @@ def force_and_columns(
         theta: Values of the unknowns, (p,).
         directions: Directions of the derivatives, (p, c); None: one derivative for each unknown.
     """
-
-    def residual(step: Array) -> tuple[Array, Array]:
-        moved = theta + (step if directions is None else directions @ step)
-        e = force_residual(scatter(places, plant, moved), data)
-        return e, e
-
-    count = theta.size if directions is None else directions.shape[1]
-    jacobian, e = jax.jacfwd(residual, has_aux=True)(jnp.zeros(count))
-    return e, jacobian
+    found = _linearised(plant, places, data, theta, directions, None)
+    return found.residual, found.columns
 
 
 @kept_jit
-def scale_columns(
-    plant: Plant, places: tuple, data: ForceData, theta: Array, directions: Array
-) -> Float[Array, "n c"]:
-    """Return the derivatives of the logarithm of the drives' ratio, by which every residual is divided.
+def force_linearised(
+    plant: Plant, places: tuple, data: ForceData, theta: Array, directions: Array, bare: BarePlant | None
+) -> Linearised:
+    """Return the force residual of a plant with its derivatives in some directions.
 
     Args:
-        plant: The plant.
+        plant, places, data, theta, directions: See `force_and_columns`.
+        bare: The plant without effects along the log, which the directions leave as it is; None: not known.
+    """
+    return _linearised(plant, places, data, theta, directions, bare)
+
+
+def _linearised(
+    plant: Plant,
+    places: tuple,
+    data: ForceData,
+    theta: Array,
+    directions: Array | None,
+    bare: BarePlant | None,
+) -> Linearised:
+    def residual(step: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        moved = theta + (step if directions is None else directions @ step)
+        e, ratio = _residual_and_ratio(scatter(places, plant, moved), data, bare)
+        return (e, jnp.log(ratio)), (e, ratio)
+
+    count = theta.size if directions is None else directions.shape[1]
+    (columns, slopes), (e, ratio) = jax.jacfwd(residual, has_aux=True)(jnp.zeros(count))
+    return Linearised(e, columns, ratio, slopes)
+
+
+def knows_bare_plant(plant: Plant, data: ForceData) -> bool:
+    """Check that a log determines what the plant does without its effects: the motion of all joints."""
+    return plant.coupled and all(data.measured) and type(plant).balance is Plant.balance
+
+
+@kept_jit
+def bare_plant(plant: Plant, data: ForceData) -> BarePlant | None:
+    """Return what the plant without its effects does along a log, if that can be known beside its effects.
+
+    Args:
+        plant: The plant; its effects do not matter.
+        data: Arrays of a log in which all joints have an encoder.
+    """
+    return bare_along(plant, data.q, data.qd, data.qdd)
+
+
+@kept_jit
+def inertial_columns(plant: Plant, places: tuple, data: ForceData, theta: Array) -> Float[Array, "kept n p"]:
+    """Return the derivatives of the inertial forces by unknowns of the plant, filtered and decimated.
+
+    Args:
+        plant: The plant without effects.
         places: Places of the unknowns in the plant.
-        data: Arrays of the prepared log.
+        data: Arrays of a log in which all joints have an encoder.
         theta: Values of the unknowns, (p,).
-        directions: Directions of the derivatives, (p, c).
     """
 
-    def logarithm(step: Array) -> Array:
-        moved = scatter(places, plant, theta + directions @ step)
-        delays = moved.command_delays(data.force.shape[1])
-        u = signals.delayed(data.force, delays, data.period, hold=data.hold)
-        motion = whole_motion(moved, data, u)
-        drive = balance_along(moved, *motion, u, data.period, data.start)[1]
-        return jnp.log(drive_ratio(moved, drive, u, data.q.shape[1]))
+    def at(motion: tuple) -> Array:
+        return jax.jacfwd(lambda theta: scatter(places, plant, theta).inertial(*motion))(theta)
 
-    return jax.jacfwd(logarithm)(jnp.zeros(directions.shape[1]))
+    columns = jax.lax.map(at, (data.q, data.qd, data.qdd))
+    filtered = data.decimator(columns.reshape(len(columns), -1))
+    return filtered.reshape(len(filtered), *columns.shape[1:])
 
 
 def measured_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:

@@ -9,7 +9,7 @@ from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, affine_flow, hold_polynomial, step
 from jaxid.effects import EFFECTS
 from jaxid.model.effect import Action, Effect
-from jaxid.numerics.affine import affine
+from jaxid.numerics.affine import Dependence, affine, dependences
 from jaxid.plants import Axis
 
 STEP = jnp.asarray(2e-3)
@@ -116,3 +116,29 @@ def test_affine_in_part_of_the_arguments():
     assert found is None  # t decides, whatever it decides
     found = affine(lambda x, t: a @ x + 1.0, (x,), (jnp.zeros(()),))
     np.testing.assert_allclose(np.asarray(found(x)), np.asarray(a @ x + 1.0), rtol=1e-15)
+
+
+@jax.custom_jvp
+def doubled(x):
+    return 2.0 * x
+
+
+doubled.defjvp(lambda x, by: (doubled(*x), 2.0 * by[0]))
+
+
+def test_each_result_has_its_own_dependence():
+    known = jnp.asarray([7.0, 8.0])
+
+    def f(x):
+        placed = known.at[1].set(x[0])
+        return (
+            known,
+            placed,
+            doubled(x),
+            jnp.where(known > 7.5, x, known),
+            jnp.sin(x),
+            jnp.where(x > 0, x, 1.0),
+        )
+
+    found = dependences(f, (np.ones(2),))
+    assert found == [Dependence.CONSTANT, *[Dependence.AFFINE] * 3, *[Dependence.OTHER] * 2]
