@@ -513,8 +513,9 @@ class _Evaluation:
             jacobian, slopes = jacobian * superset.enters, slopes * superset.enters
         if self.kept:
             assert self.bare is not None, "only a known plant has kept columns"
+            assert self.bare.columns is not None, "they are kept"
             jacobian[..., superset.own] = self.bare.columns / first.ratio[:, None]
-        return first.residual, jacobian, slopes
+        return np.asarray(first.residual), jacobian, slopes
 
 
 def _blocks(colours: np.ndarray) -> list[np.ndarray]:

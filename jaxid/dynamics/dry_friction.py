@@ -146,8 +146,8 @@ def set_valued_step(
     zeros = varying(jnp.zeros(len(ports)), x.qd)
     no = jnp.zeros(len(ports), bool)
     first = _Trial(jnp.zeros((), bool), x, varying(drag, x.qd), _Answer(zeros, no, no, 1.0 + zeros))
-    end, _ = jax.lax.scan(once, first, jnp.arange(3))
-    return under(end.answer, end.after, end.reaction)
+    last, _ = jax.lax.scan(once, first, jnp.arange(3))
+    return under(last.answer, last.after, last.reaction)
 
 
 class _Trial(NamedTuple):

@@ -26,7 +26,7 @@ from jaxid.numerics.affine import depends
 @eqx.filter_jit
 def _balance_of(plant: Plant, bare: BarePlant | None, *now: Any) -> Balance:
     """Compute the balance at one instant, with smoothed dry friction."""
-    return plant.balance(*now) if bare is None else balance(plant, *now, None, bare)
+    return plant.balance(*now) if bare is None else balance(plant, *now, reaction=None, bare=bare)
 
 
 def bare_along(plant: Plant, q: Array, qd: Array, qdd: Array) -> BarePlant | None:
