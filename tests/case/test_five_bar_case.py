@@ -11,7 +11,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.choice import choose_method
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.recursive.estimate import recursive_steps
-from jaxid.experiment_design.in_loop import _DesignProblem
+from jaxid.experiment_design.in_loop import LoopDesign
 from jaxid.numerics.lanes import run_alone
 from jaxid.session import open_session
 from jaxid.settings import Recursive
@@ -236,9 +236,9 @@ def test_an_experiment_is_designed_from_where_the_robot_starts(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=r"initial_position: joints at \[0, 0\] rad are out of reach"):
-        _DesignProblem.of(load_case(path))
+        LoopDesign.of(load_case(path))
     path.write_text(text + "initial_position = [1.1, 2.0]\n")
-    bench = _DesignProblem.of(load_case(path))
+    bench = LoopDesign.of(load_case(path))
     peaks = bench.peaks(np.zeros((len(bench.shapes.signal(bench.starts[0])), 2)))
     np.testing.assert_allclose([peaks.low, peaks.high], [[1.1, 2.0]] * 2)
 
