@@ -8,7 +8,7 @@ import pytest
 from jaxid.commands.check import check
 from jaxid.commands.identify import identify
 from jaxid.estimators.apart.joint import joints_alone, stands_apart
-from jaxid.estimators.apart.start import start_by_balance
+from jaxid.estimators.apart.start import starts_by_balance
 from jaxid.estimators.several.parts import parts_of
 from jaxid.gap import simulation_of_log
 from jaxid.session import open_session
@@ -56,12 +56,12 @@ def test_a_joint_with_its_load_moves_as_mujoco_moves_it(folder):
 def test_the_start_is_near_although_the_file_is_far_off(folder):
     session = session_of(folder)
     first, second = joints_alone(session.machine, parts_of(session))
-    values = dict(zip(first.machine.parameters.names, start_by_balance(first), strict=True))
+    values = dict(zip(first.machine.parameters.names, starts_by_balance(first)[0], strict=True))
     assert values["controller.kp[1]"] == pytest.approx(60.0, rel=0.2)
     assert values["controller.kd[1]"] + values["viscous_friction[1].coefficient"] == pytest.approx(
         2.5, rel=0.2
     )
-    assert start_by_balance(second)[second.machine.parameters.names.index("controller.kp[2]")] > 10.0
+    assert starts_by_balance(second)[0][second.machine.parameters.names.index("controller.kp[2]")] > 10.0
 
 
 def test_only_an_arm_of_servos_without_unknown_links_stands_apart(folder):

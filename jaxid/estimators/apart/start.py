@@ -1,4 +1,4 @@
-"""The start of a fit of a servo's joint, by a balance that is linear in the reciprocal of its gain.
+"""Starts of a fit of a servo's joint, by a balance that is linear in the reciprocal of its gain.
 
 With the law u = kp (r - q) - kd dq the error of the position is
 
@@ -6,9 +6,14 @@ With the law u = kp (r - q) - kd dq the error of the position is
 
 in which only the delay of the reference r is not linear. Errors of the encoder are small beside the error of
 the position, and nothing has to be near the truth: a gain of the file may be wrong by a factor of fifty.
+Where a joint carries little, the accelerations alone hardly show the gain. So some gains are tried too, each
+with the friction that fits it best.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
@@ -16,20 +21,23 @@ from jaxtyping import Float
 
 from jaxid.controllers.linear import CascadePD
 from jaxid.estimators.apart.joint import JointAlone
-from jaxid.estimators.several.parts import Part
 from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER
 
 # Delays that are tried, if the delay is unknown [s].
-_DELAYS = np.arange(0.0, 0.305, 0.005)
-# Largest factor by which the start may differ from the guess.
+_DELAYS = np.arange(0.0, 0.205, 0.005)
+# Gains that are tried, as parts of the guess; far above that of a file the sampled loop would not be stable.
+_GAINS = (1 / 300, 1 / 100, 1 / 30, 1 / 10, 1 / 3, 1.0)
+# Largest factor by which a start may differ from the guess.
 _FARTHEST = 1e3
 # Part of the guess at which a friction starts that the balance does not show.
 _LITTLE = 1e-2
+# Part of the spread of the velocity from which a joint counts as moving, and the fewest such rows.
+_MOVING, _FEWEST = 0.2, 10
 
 
-def start_by_balance(alone: JointAlone) -> Float[np.ndarray, " own"] | None:
-    """Return values of a joint's unknowns by the balance of its servo; None if it gives no gain.
+def starts_by_balance(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
+    """Return values of a joint's unknowns by the balance of its servo, the one with the best gain first.
 
     Unknowns that do not enter the balance stay at their guesses.
 
@@ -39,23 +47,102 @@ def start_by_balance(alone: JointAlone) -> Float[np.ndarray, " own"] | None:
     machine = alone.machine
     unknown = {_role(f.path, machine): k for k, f in enumerate(machine.parameters.free)}
     if "kp" not in unknown:
-        return None
-    delays = _DELAYS if "delay" in unknown else np.array([_delay(machine)])
-    found = [_balance(alone.parts, delay) for delay in delays]
-    best = int(np.argmin([misfit for _, misfit in found]))
-    (compliance, lag, dry), _ = found[best]
-    if compliance <= 0:
-        return None
+        return []
+    balance = _Balance.of(alone)
+    if balance is None:
+        return []
+    delays = range(len(_DELAYS)) if "delay" in unknown else [_nearest(_delay(machine))]
+    return [_start(machine, unknown, found) for found in balance.solutions(delays, _stiffness(machine))]
 
-    stiffness, drive = 1.0 / compliance, float(np.abs(machine.gain[0]))
-    damping, known = lag * stiffness, _damping(machine)
+
+@dataclass(frozen=True)
+class _Found:
+    """Reciprocal of the gain, damping and dry friction over the gain, and the delay."""
+
+    compliance: float
+    lag: float
+    dry: float
+    delay: float
+
+
+@dataclass(frozen=True)
+class _Balance:
+    """The balance at all rows in motion, reduced to a triangular matrix.
+
+    Args:
+        matrix: Coefficients of the three unknowns, (3, 3).
+        errors: Reduced error of the position by delay, (delays, 3).
+        rest: Norm of what no value explains, by delay, (delays,).
+    """
+
+    matrix: Float[np.ndarray, "3 3"]
+    errors: Float[np.ndarray, "delays 3"]
+    rest: Float[np.ndarray, " delays"]
+
+    @classmethod
+    def of(cls, alone: JointAlone) -> _Balance | None:
+        """Return the balance along all logs of a joint; None if it hardly moves."""
+        rows, errors = [], []
+        for part in alone.parts:
+            log, machine = part.log, part.machine
+            assert log.reference is not None, "checked by stands_apart"
+            assert machine.load is not None, "a joint alone has one"
+            q, v, a = (x[:, 0] for x in (part.data.q, part.data.qd, part.data.qdd))
+            force = float(np.asarray(machine.plant.own_inertia())) * a - machine.load[:, 0]
+            # Of rest the balance says no more than an interval for dry friction.
+            counts = np.abs(v) > _MOVING * np.std(v)
+            counts &= log.time > log.time[0] + _DELAYS[-1]
+            late = [np.interp(log.time[counts] - d, log.time, log.reference[:, 0]) for d in _DELAYS]
+            rows.append(np.stack([force, v, np.sign(v)], axis=1)[counts])
+            errors.append(np.stack(late) - q[counts])
+        matrix, error = np.concatenate(rows), np.concatenate(errors, axis=1)
+        if len(matrix) < _FEWEST:
+            return None
+        basis, triangle = np.linalg.qr(matrix)
+        inside = error @ basis
+        rest = np.sum(error**2, axis=1) - np.sum(inside**2, axis=1)
+        return cls(triangle, inside, np.sqrt(np.maximum(rest, 0.0)))
+
+    def solutions(self, delays: range | list[int], stiffness: float) -> Iterator[_Found]:
+        """Return the best values at any gain, and those at some gains about a guess."""
+        best = self._best(delays, None)
+        if best.compliance > 0:
+            yield best
+        for part in _GAINS:
+            yield self._best(delays, 1.0 / (part * stiffness))
+
+    def _best(self, delays: range | list[int], compliance: float | None) -> _Found:
+        found = [self._at(k, compliance) for k in delays]
+        return min(found, key=lambda one: one[1])[0]
+
+    def _at(self, delay: int, compliance: float | None) -> tuple[_Found, float]:
+        """Return the values at a delay, and the misfit; a gain may be given."""
+        free = self.matrix if compliance is None else self.matrix[:, 1:]
+        error = self.errors[delay] - (0.0 if compliance is None else compliance * self.matrix[:, 0])
+        size = np.maximum(np.linalg.norm(free, axis=0), 1e-300)
+        values, misfit = scipy.optimize.nnls(free / size, error)
+        values = values / size
+        if compliance is not None:
+            values = np.append(compliance, values)
+        found = _Found(*(float(x) for x in values), float(_DELAYS[delay]))
+        return found, float(np.hypot(misfit, self.rest[delay]))
+
+
+def _start(machine: Machine, unknown: dict[str, int], found: _Found) -> Float[np.ndarray, " own"]:
+    """Return values of the unknowns for a solution of the balance."""
+    stiffness, drive = 1.0 / found.compliance, float(np.abs(machine.gain[0]))
+    damping, known = found.lag * stiffness, _damping(machine)
     free = [name for name in ("kd", "viscous") if name in unknown]
     # Both dampings act alike: their guesses divide the sum that was found.
     spare = max(damping - sum(v for n, v in known.items() if n not in free), _LITTLE * damping)
-    parts = {n: spare * max(known[n], 1e-12) / sum(max(known[m], 1e-12) for m in free) for n in free}
-    values = {"kp": stiffness / drive, "dry": dry * stiffness, "delay": float(delays[best]), **parts}
-    if "kd" in parts:
-        values["kd"] = parts["kd"] / drive
+    weights = {n: max(known[n], 1e-12) for n in free}
+    values = {n: spare * weights[n] / sum(weights.values()) for n in free}
+    values |= {"kp": stiffness / drive, "dry": found.dry * stiffness, "delay": found.delay}
+    if "kd" in free:
+        values["kd"] /= drive
+    if isinstance(machine.controller, CascadePD):
+        # Its gain of the position multiplies that of the velocity.
+        values["kp"] /= max(values.get("kd", known["kd"] / drive), 1e-12)
 
     start, guess = machine.parameters.guess, machine.parameters.guess
     for name, value in values.items():
@@ -65,10 +152,6 @@ def start_by_balance(alone: JointAlone) -> Float[np.ndarray, " own"] | None:
         size = abs(guess[k]) if guess[k] else max(abs(value), 1e-12)
         least = 0.0 if name == "delay" else _LITTLE * size / _FARTHEST
         start[k] = np.clip(value, least, _FARTHEST * size)
-    if isinstance(machine.controller, CascadePD):
-        # Its gain of the position multiplies that of the velocity.
-        rate = float(start[unknown["kd"]]) if "kd" in unknown else known["kd"] / drive
-        start[unknown["kp"]] = stiffness / drive / max(rate, 1e-12)
     return np.clip(start, *machine.parameters.bounds)
 
 
@@ -88,6 +171,18 @@ def _delay(machine: Machine) -> float:
     return 0.0 if law is None or law.delay is None else float(np.max(np.asarray(law.delay)))
 
 
+def _nearest(delay: float) -> int:
+    return int(np.argmin(np.abs(_DELAYS - delay)))
+
+
+def _stiffness(machine: Machine) -> float:
+    """Return the stiffness of the servo at the guesses, seen at the joint."""
+    law = machine.controller
+    inner = np.max(np.asarray(law.kv)) if isinstance(law, CascadePD) else 1.0
+    kp = np.max(np.asarray(getattr(law, "kp")))  # noqa: B009 (a law of either class)
+    return float(np.abs(machine.gain[0]) * kp * inner)
+
+
 def _damping(machine: Machine) -> dict[str, float]:
     """Return the damping of the servo and that of the joint at their guesses, seen at the joint."""
     law = machine.controller
@@ -97,26 +192,3 @@ def _damping(machine: Machine) -> dict[str, float]:
         "kd": float(np.abs(machine.gain[0]) * np.max(np.asarray(kd))),
         "viscous": sum(float(np.asarray(e.coefficient)) for e in own),  # pyright: ignore[reportAttributeAccessIssue]
     }
-
-
-def _balance(parts: tuple[Part, ...], delay: float) -> tuple[Float[np.ndarray, "3"], float]:
-    """Return 1/kp, damping over kp and dry friction over kp, and the misfit at a delay of the reference."""
-    rows, errors = [], []
-    for part in parts:
-        log, machine = part.log, part.machine
-        assert log.reference is not None, "checked by stands_apart"
-        assert machine.load is not None, "a joint alone has one"
-        late = np.interp(log.time - delay, log.time, log.reference[:, 0])
-        q, v, a = (x[:, 0] for x in (part.data.q, part.data.qd, part.data.qdd))
-        speed = np.std(v)
-        force = float(np.asarray(machine.plant.own_inertia())) * a - machine.load[:, 0]
-        # Of rest the balance says no more than an interval for dry friction.
-        counts = (np.abs(v) > 0.2 * speed) & (log.time > log.time[0] + _DELAYS[-1])
-        rows.append(np.stack([force, v, np.sign(v)], axis=1)[counts])
-        errors.append((late - q)[counts])
-    matrix, error = np.concatenate(rows), np.concatenate(errors)
-    if len(error) < 10:
-        return np.zeros(3), np.inf
-    size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-    found, misfit = scipy.optimize.nnls(matrix / size, error)
-    return found / size, float(misfit)
