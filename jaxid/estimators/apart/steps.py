@@ -22,6 +22,8 @@ from jaxid.simulation.replay import Numerics
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import needed_steps
 
+# Part of the cost by which several logs have converged: what servos leave is far more than noise.
+_TOLERANCE = 1e-7
 # Starts in a compiled call.
 _LANES = 8
 _NOTE = (
@@ -52,7 +54,13 @@ def apart_steps(
         start = _start(alone, numerics)
         fits.append(
             output_error_steps(
-                alone.machine, alone.parts, start=start, numerics=numerics, profile=own, **options
+                alone.machine,
+                alone.parts,
+                start=start,
+                numerics=numerics,
+                profile=own,
+                tolerance=_TOLERANCE,
+                **options,
             )
         )
     found = yield from side_by_side(fits)
