@@ -82,7 +82,7 @@ def test_servos_that_follow_a_reference_need_no_force(folder):
     first = init(write_csv(folder / "moves.csv", renamed), mjcf=folder / "robot.xml", folder=folder)
     assert first.tables["log"]["reference"] == {"a": "q_ref_a", "b": "q_ref_b"}
     case = first.case()
-    assert set(case.controller.unknown) == {"kp", "kd"}
+    assert set(case.controller.unknown) == {"kp", "kd", "delay"}
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 from jaxid.commands.check import check
 from jaxid.commands.identify import identify
 from jaxid.estimators.apart.joint import joints_alone, stands_apart
-from jaxid.estimators.apart.start import starts_by_balance
+from jaxid.estimators.apart.start import is_stable, starts_by_balance
 from jaxid.estimators.several.parts import parts_of
 from jaxid.gap import simulation_of_log
 from jaxid.session import open_session
@@ -62,6 +62,15 @@ def test_the_start_is_near_although_the_file_is_far_off(folder):
         2.5, rel=0.2
     )
     assert starts_by_balance(second)[0][second.machine.parameters.names.index("controller.kp[2]")] > 10.0
+
+
+def test_a_gain_that_the_period_of_the_servo_does_not_allow_is_no_start(folder):
+    machine = joints_alone(session_of(folder).machine, parts_of(session_of(folder)))[1].machine
+    at = machine.parameters.names.index("controller.kp[2]")
+    for gain, stable in ((20.0, True), (1e5, False)):
+        theta = machine.parameters.guess
+        theta[at] = gain
+        assert is_stable(machine.with_estimate(theta)) == stable
 
 
 def test_only_an_arm_of_servos_without_unknown_links_stands_apart(folder):

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 import scipy.optimize
 from jaxtyping import Float
 
@@ -26,7 +27,7 @@ from jaxid.model.unknowns import CONTROLLER
 
 # Delays that are tried, if the delay is unknown [s].
 _DELAYS = np.arange(0.0, 0.205, 0.005)
-# Gains that are tried, as parts of the guess; far above that of a file the sampled loop would not be stable.
+# Gains that are tried, as parts of the guess.
 _GAINS = (1 / 300, 1 / 100, 1 / 30, 1 / 10, 1 / 3, 1.0)
 # Largest factor by which a start may differ from the guess.
 _FARTHEST = 1e3
@@ -52,7 +53,24 @@ def starts_by_balance(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
     if balance is None:
         return []
     delays = range(len(_DELAYS)) if "delay" in unknown else [_nearest(_delay(machine))]
-    return [_start(machine, unknown, found) for found in balance.solutions(delays, _stiffness(machine))]
+    starts = [_start(machine, unknown, found) for found in balance.solutions(delays, _stiffness(machine))]
+    return [start for start in starts if is_stable(machine.with_estimate(start))]
+
+
+def is_stable(machine: Machine) -> bool:
+    """Check that the sampled loop of a joint, without its delay and dry friction, comes to rest.
+
+    A loop that does not may still end near the log, in a small vibration between the limits of its force, and
+    its derivatives grow without bound.
+    """
+    law, inertia = machine.controller, float(np.asarray(machine.plant.own_inertia()))
+    assert law is not None, "checked by stands_apart"
+    known = _damping(machine)
+    # State and held force over one period: d/dt (q, v, u) = (v, (u - c v) / J, 0).
+    rates = np.array([[0, 1, 0], [0, -known["viscous"] / inertia, 1 / inertia], [0, 0, 0]], dtype=float)
+    over = scipy.linalg.expm(rates * law.period)
+    closed = over[:2, :2] - np.outer(over[:2, 2], [_stiffness(machine), known["kd"]])
+    return bool(np.max(np.abs(np.linalg.eigvals(closed))) < 1.0)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.estimators.apart.joint import JointAlone, joints_alone
-from jaxid.estimators.apart.start import starts_by_balance
+from jaxid.estimators.apart.start import is_stable, starts_by_balance
 from jaxid.estimators.coarse_starts import costs_along
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import output_error_steps
@@ -126,7 +126,8 @@ def precision_apart(machine: Machine, parts: Sequence[Part]) -> Precision:
 
 def _start(alone: JointAlone, numerics: Numerics) -> np.ndarray:
     """Return the best of the guesses and the starts by balance, along the fastest log in simulation."""
-    points = np.stack([alone.machine.parameters.guess, *starts_by_balance(alone)])
+    guess, found = alone.machine.parameters.guess, starts_by_balance(alone)
+    points = np.stack([guess, *found] if is_stable(alone.machine) or not found else found)
     if len(points) == 1:
         return points[0]
     fastest = max(alone.parts, key=lambda part: float(np.std(np.diff(part.log.filled, axis=0))))
