@@ -3,6 +3,7 @@
 import json
 import tomllib
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -83,6 +84,26 @@ def test_servos_that_follow_a_reference_need_no_force(folder):
     assert first.tables["log"]["reference"] == {"a": "q_ref_a", "b": "q_ref_b"}
     case = first.case()
     assert set(case.controller.unknown) == {"kp", "kd", "delay"}
+
+
+@pytest.mark.slow
+def test_servos_without_a_force_end_in_the_robots_file(folder, capsys):
+    (folder / "robot.xml").write_text(text(SERVOS, kp=3000, mass=1.4))
+    columns = {n: x for n, x in logged(text(SERVOS, kp=60, **TRUE)).items() if n not in ("ua", "ub")}
+    called = {"qa": "q_a", "qb": "q_b", "ra": "q_ref_a", "rb": "q_ref_b"}
+    log = write_csv(folder / "moves.csv", {called.get(n, n): x for n, x in columns.items()})
+    out = folder / "out"
+    ran = run(capsys, "identify", folder / "robot.xml", log, folder=out)
+    assert ran.status == 0
+    assert "replay by MuJoCo: RMS from the log, your file -> exported" in ran.out
+    found = mujoco.MjModel.from_xml_path(str(out / "robot_found.xml"))
+    assert found.actuator_gainprm[:, 0] == pytest.approx([60.0, 20.0], rel=0.03)
+    assert found.dof_frictionloss[0] == pytest.approx(0.3, rel=0.03)
+    # The user's own file stays as it was.
+    assert 'kp="3000"' in (folder / "robot.xml").read_text()
+    [line] = [line for line in ran.out.splitlines() if line.startswith("moves")]
+    before, after = (float(x) for x in line.split()[1:4:2])
+    assert before > 10 * after
 
 
 @pytest.mark.slow
