@@ -9,6 +9,7 @@ import pytest
 
 from jaxid.case.case import load_case
 from jaxid.cli import main
+from jaxid.commands.discover import discover
 from jaxid.commands.init import init
 from jaxid.commands.robot_case import RobotCase, let_go
 from jaxid.errors import InputError
@@ -84,6 +85,23 @@ def test_servos_that_follow_a_reference_need_no_force(folder):
     assert first.tables["log"]["reference"] == {"a": "q_ref_a", "b": "q_ref_b"}
     case = first.case()
     assert set(case.controller.unknown) == {"kp", "kd", "delay"}
+
+
+def test_a_search_of_several_servos_without_a_force_is_refused_at_once(tmp_path):
+    inertial = '<inertial pos="0 0 0.05" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>'
+    link = '<body pos="0 0 0.1"><joint name="{n}" axis="0 1 0"/>' + inertial
+    servos = "".join(f'<position joint="{n}" kp="20" kv="1"/>' for n in "abc")
+    body = "".join(link.format(n=n) for n in "abc") + 3 * "</body>"
+    file = tmp_path / "arm.xml"
+    file.write_text(f"<mujoco><worldbody>{body}</worldbody><actuator>{servos}</actuator></mujoco>")
+    t = np.arange(400) / 100
+    columns = {"t": t}
+    for k, n in enumerate("abc", start=2):
+        columns |= {f"q_{n}": np.sin(k * t), f"q_ref_{n}": np.sin(k * t + 0.1)}
+    log = write_csv(tmp_path / "log.csv", columns)
+    made = RobotCase.of(str(file), [str(log)], search=True)
+    with pytest.raises(InputError, match="takes one joint, and the case has 3"):
+        discover(made.tables, str(log))
 
 
 @pytest.mark.slow

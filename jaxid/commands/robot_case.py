@@ -76,8 +76,8 @@ class RobotCase:
             folder: The folder.
 
         Returns:
-            What was written, what the file cannot hold, and how MuJoCo follows the logs with it. A URDF has no
-            servos, and is not written.
+            Lines on the file, on anything that it cannot hold, and on how MuJoCo follows the logs with it. A
+            URDF has no servos, and is not written.
         """
         if self.robot.suffix.lower() == ".urdf":
             return ""

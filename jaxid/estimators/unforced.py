@@ -46,7 +46,7 @@ _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
 def unforced_steps(session: Session, *, numerics: Numerics | None = None, **options: Any) -> Steps[Estimate]:
     """Fit the positions of loops whose force was not logged, from several starts, to one log or to several.
 
-    The joints of an arm are fitted one by one if each has a servo of its own, see `jaxid.estimators.apart`.
+    The joints of an arm are fitted one by one if each has a servo, see `jaxid.estimators.apart`.
 
     Args:
         session: Case and logs of the fit.

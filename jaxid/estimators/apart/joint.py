@@ -1,8 +1,8 @@
 """A joint of an arm in its loop, with the forces of the links along the motion that was measured.
 
-In the loop of a servo a joint follows its command closely, and so do all others. What the links ask of it
-then hardly differs from what they ask along the measured motion, which the links' parameters give. With that
-as a known load the joint is an axis of its own.
+In the loop of a servo a joint follows its command closely, and so do all others. The force of the links on
+it then hardly differs from that along the measured motion, which the links' parameters give. With that force
+as a known load the joint is an axis.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class JointAlone:
 def stands_apart(machine: Machine, parts: Sequence[Part]) -> bool:
     """Check that every joint of a machine can be fitted alone.
 
-    It is an arm of several joints whose positions were all measured, each with a servo of its own, and no
-    unknown belongs to several joints.
+    It is an arm of several joints whose positions were all measured, each with a servo, and no unknown
+    belongs to several joints.
 
     Args:
         machine: Machine of all logs.
@@ -122,7 +122,7 @@ def joints_alone(machine: Machine, parts: Sequence[Part]) -> list[JointAlone]:
             continue
         alone = []
         for part, load in zip(parts, loads, strict=True):
-            # What the constant inertia of the axis does not ask for.
+            # The force of the links beyond that of the constant inertia of the axis.
             beside = means[joint] * part.data.qdd[:, joint] - load[:, joint]
             one = _machine(part.machine, joint, means[joint], beside)
             index = np.array([own.index(name) for name in one.parameters.names], dtype=int)
