@@ -24,6 +24,8 @@ from jaxid.simulation.step_size import needed_steps
 
 # Part of the cost by which several logs have converged: what servos leave is far more than noise.
 _TOLERANCE = 1e-7
+# Part of the squared residual of the start by balance below which another start is taken.
+_CLEARLY = 0.7
 # Starts in a compiled call.
 _LANES = 8
 _NOTE = (
@@ -125,7 +127,11 @@ def precision_apart(machine: Machine, parts: Sequence[Part]) -> Precision:
 
 
 def _start(alone: JointAlone, numerics: Numerics) -> np.ndarray:
-    """Return the best of the guesses and the starts by balance, along the fastest log in simulation."""
+    """Return the start of a joint's fit: that by balance, or one that is clearly better in simulation.
+
+    A model that lacks much leaves about as much at very different gains, and the highest ones say no more than
+    that a joint goes to its command.
+    """
     guess, found = alone.machine.parameters.guess, starts_by_balance(alone)
     points = np.stack([guess, *found] if is_stable(alone.machine) or not found else found)
     if len(points) == 1:
@@ -133,7 +139,8 @@ def _start(alone: JointAlone, numerics: Numerics) -> np.ndarray:
     fastest = max(alone.parts, key=lambda part: float(np.std(np.diff(part.log.filled, axis=0))))
     # A gain that is unknown in another log only stays at its guess here.
     costs = costs_along(fastest, numerics, points, _LANES)
-    return points[int(np.argmin(costs))]
+    best, usual = int(np.argmin(costs)), len(points) - len(found)
+    return points[best if not costs[best] > _CLEARLY * costs[usual] else usual]
 
 
 def _of_arm(
