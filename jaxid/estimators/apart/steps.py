@@ -129,8 +129,8 @@ def precision_apart(machine: Machine, parts: Sequence[Part]) -> Precision:
 def _start(alone: JointAlone, numerics: Numerics) -> np.ndarray:
     """Return the start of a joint's fit: that by balance, or one that is clearly better in simulation.
 
-    A model that lacks much leaves about as much at very different gains, and the highest ones say no more than
-    that a joint goes to its command.
+    A model that lacks much leaves about as much at very different gains, and the highest ones only say that a
+    joint goes to its command.
     """
     guess, found = alone.machine.parameters.guess, starts_by_balance(alone)
     points = np.stack([guess, *found] if is_stable(alone.machine) or not found else found)
