@@ -142,7 +142,8 @@ class _Balance:
         values = values / size
         if compliance is not None:
             values = np.append(compliance, values)
-        found = _Found(*(float(x) for x in values), float(_DELAYS[delay]))
+        inverse, lag, dry = (float(x) for x in values)
+        found = _Found(inverse, lag, dry, float(_DELAYS[delay]))
         return found, float(np.hypot(misfit, self.rest[delay]))
 
 
