@@ -378,7 +378,9 @@ def _controller(
             settings = Recursive(**{k: arrays.pop(k) for k in ON_LINE if k in arrays})
             arrays["estimator"] = _estimator(case, known, period, settings)
 
-    own = case.log is not None and case.log.loop_velocity is not None
+    # Servos of a robot's file have the velocity of their joints, as in its simulator.
+    of_file = "controller" not in case.tables
+    own = of_file or (case.log is not None and case.log.loop_velocity is not None)
     return cls(period=period, own_velocity=own, **arrays)
 
 

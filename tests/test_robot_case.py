@@ -3,11 +3,13 @@
 import json
 import tomllib
 
+import mujoco
 import numpy as np
 import pytest
 
 from jaxid.case.case import load_case
 from jaxid.cli import main
+from jaxid.commands.discover import discover
 from jaxid.commands.init import init
 from jaxid.commands.robot_case import RobotCase, let_go
 from jaxid.errors import InputError
@@ -82,7 +84,44 @@ def test_servos_that_follow_a_reference_need_no_force(folder):
     first = init(write_csv(folder / "moves.csv", renamed), mjcf=folder / "robot.xml", folder=folder)
     assert first.tables["log"]["reference"] == {"a": "q_ref_a", "b": "q_ref_b"}
     case = first.case()
-    assert set(case.controller.unknown) == {"kp", "kd"}
+    assert set(case.controller.unknown) == {"kp", "kd", "delay"}
+
+
+def test_a_search_of_several_servos_without_a_force_is_refused_at_once(tmp_path):
+    inertial = '<inertial pos="0 0 0.05" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>'
+    link = '<body pos="0 0 0.1"><joint name="{n}" axis="0 1 0"/>' + inertial
+    servos = "".join(f'<position joint="{n}" kp="20" kv="1"/>' for n in "abc")
+    body = "".join(link.format(n=n) for n in "abc") + 3 * "</body>"
+    file = tmp_path / "arm.xml"
+    file.write_text(f"<mujoco><worldbody>{body}</worldbody><actuator>{servos}</actuator></mujoco>")
+    t = np.arange(400) / 100
+    columns = {"t": t}
+    for k, n in enumerate("abc", start=2):
+        columns |= {f"q_{n}": np.sin(k * t), f"q_ref_{n}": np.sin(k * t + 0.1)}
+    log = write_csv(tmp_path / "log.csv", columns)
+    made = RobotCase.of(str(file), [str(log)], search=True)
+    with pytest.raises(InputError, match="takes one joint, and the case has 3"):
+        discover(made.tables, str(log))
+
+
+@pytest.mark.slow
+def test_servos_without_a_force_end_in_the_robots_file(folder, capsys):
+    (folder / "robot.xml").write_text(text(SERVOS, kp=3000, mass=1.4))
+    columns = {n: x for n, x in logged(text(SERVOS, kp=60, **TRUE)).items() if n not in ("ua", "ub")}
+    called = {"qa": "q_a", "qb": "q_b", "ra": "q_ref_a", "rb": "q_ref_b"}
+    log = write_csv(folder / "moves.csv", {called.get(n, n): x for n, x in columns.items()})
+    out = folder / "out"
+    ran = run(capsys, "identify", folder / "robot.xml", log, folder=out)
+    assert ran.status == 0
+    assert "replay by MuJoCo: RMS from the log, your file -> exported" in ran.out
+    found = mujoco.MjModel.from_xml_path(str(out / "robot_found.xml"))
+    assert found.actuator_gainprm[:, 0] == pytest.approx([60.0, 20.0], rel=0.03)
+    assert found.dof_frictionloss[0] == pytest.approx(0.3, rel=0.03)
+    # The user's own file stays as it was.
+    assert 'kp="3000"' in (folder / "robot.xml").read_text()
+    [line] = [line for line in ran.out.splitlines() if line.startswith("moves")]
+    before, after = (float(x) for x in line.split()[1:4:2])
+    assert before > 10 * after
 
 
 @pytest.mark.slow

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from jaxid.command_line.inputs import (
     first_case_files,
+    found_robot_files,
     logs_of,
     need_known,
     need_known_numerics,
@@ -74,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     need_known_numerics(args)
     need_known("on", args.on, OUTPUTS)
     files = ("result.json", "report.html")
-    need_writable(args, *files, *first_case_files(args))
+    need_writable(args, *files, *first_case_files(args), *found_robot_files(args))
     case, made = sound_case(args)
 
     with progress_of(args) as show:
@@ -94,4 +96,7 @@ def run(args: argparse.Namespace) -> int:
             progress=show,
         )
     print(result)
-    return save_result(args, result, *files, made=made)
+    status = save_result(args, result, *files, made=made)
+    if made is not None and args.o is not None and result.session.machine.unforced(result.session.fit.log):
+        print(made.save_servos(result, Path(args.o)))
+    return status

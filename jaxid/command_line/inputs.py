@@ -95,6 +95,13 @@ def first_case_files(args: argparse.Namespace) -> list[str]:
     return [FIRST_CASE] if is_robot(args.case) else []
 
 
+def found_robot_files(args: argparse.Namespace) -> list[str]:
+    """Return the name of the MJCF with the result in it, if one is given in place of a case."""
+    from jaxid.commands.robot_case import found_file
+
+    return [found_file(args.case)] if is_robot(args.case) and not args.case.endswith(".urdf") else []
+
+
 def logs_of(args: argparse.Namespace) -> str | list[str] | None:
     """Return the logs of a command: one, several, or none."""
     return args.log[0] if len(args.log) == 1 else args.log or None

@@ -191,6 +191,13 @@ def check(case: CaseLike, log: Logs = None, *, validate: Sequence[LogLike] = ())
     """
     session = open_session(case, log, validate, piecewise=True)
     floor = noise_floor(session.machine, session.fit.log, session.fit.data)
+    if session.machine.unforced(session.fit.log):
+        from jaxid.estimators.apart.joint import stands_apart
+        from jaxid.estimators.apart.steps import precision_apart
+
+        parts = parts_of(session)
+        if stands_apart(session.machine, parts):
+            return Check(session, precision_apart(session.machine, parts), floor)
     if session.more:
         return Check(session, _precision_together(session), floor)
     machine, data = session.machine, session.fit.data

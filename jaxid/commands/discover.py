@@ -125,6 +125,7 @@ def explore(
     need_known_reference(session, "an error of it would be taken for an effect")
     chosen, max_effects = max_effects is None, _EFFECTS if max_effects is None else max_effects
     if session.machine.unforced(session.fit.log):
+        _need_one_servo(session)
         return explore_unforced(session, max_effects=max_effects, progress=progress)
     need_force(session, "a search of a log with a force")
     _need_no_command_effects(session)
@@ -268,6 +269,19 @@ def _with_break_aways(
         steps.append(step)
         found = _Found(estimate, (*found.effects, effect), where, unseen)
     return found
+
+
+def _need_one_servo(session: Session) -> None:
+    """Refuse a search of several servos without a force, whose loop would be simulated for hours.
+
+    Raises:
+        InputError: If the machine is an arm of several joints.
+    """
+    joints = session.machine.plant.joints
+    if session.machine.plant.coupled and joints > 2:
+        hint = 'fit the servos by identify; for a search state one joint as kind = "axis"'
+        what = f"a search without a force takes one joint, and the case has {joints}"
+        raise InputError(what, where=session.case.where, hint=hint)
 
 
 def _need_no_command_effects(session: Session) -> None:

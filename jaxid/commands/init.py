@@ -25,7 +25,7 @@ from jaxid.logs.log import Log
 
 # Values of a robot's file that forces show, and those that a servo's motion along a known reference shows.
 UNKNOWN_OF_FORCES = ("base", "armature", "damping", "frictionloss")
-UNKNOWN_OF_SERVOS = ("damping", "frictionloss", "kp", "kv")
+UNKNOWN_OF_SERVOS = ("damping", "frictionloss", "kp", "kv", "delay", "forcerange")
 _TITLE = (
     "Lines that begin with `assumed` say what the log seemed to show.",
     "Lines that begin with `question` ask what only you know. Neither stops a command.",

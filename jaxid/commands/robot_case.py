@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxid.case.mjcf import read_mjcf
 from jaxid.case.robot import Robot
@@ -14,6 +14,9 @@ from jaxid.commands.init import FirstCase, init
 from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.names import FIRST_CASE
+
+if TYPE_CHECKING:
+    from jaxid.commands.identify import Identification
 
 # Simulation of a robot that is let go: its length [s], and the most samples a second.
 _SECONDS, _RATE = 5.0, 500.0
@@ -64,6 +67,38 @@ class RobotCase:
         path = folder / FIRST_CASE
         write_whole(path, _first(self.robot, self.log, self.unknown, folder).text)
         return path
+
+    def save_servos(self, result: Identification, folder: Path) -> str:
+        """Write the robot's MJCF with the servos of a fit without a force beside its result.
+
+        Args:
+            result: The fit, whose result.json is in the folder.
+            folder: The folder.
+
+        Returns:
+            Lines on the file, on anything that it cannot hold, and on how MuJoCo follows the logs with it. A
+            URDF has no servos, and is not written.
+        """
+        if self.robot.suffix.lower() == ".urdf":
+            return ""
+        from jaxid.commands.export import export, machine_of
+        from jaxid.export.servo_replay import replay_servos
+
+        stored = folder / "result.json"
+        exported, path = export(stored, "mjcf", self.robot), folder / found_file(str(self.robot))
+        write_whole(path, exported.content)
+        lines = [f"not exported: {note}" for note in exported.notes]
+        lines.append(f"changed {', '.join(exported.changed) or 'nothing'} in {path}")
+        if b"file=" in exported.content:
+            lines.append(f"it looks for its meshes beside it: copy it to {self.robot.parent}")
+        replayed = replay_servos(result, machine_of(stored)[0], exported, self.robot)
+        return "\n".join([*lines, "", str(replayed)])
+
+
+def found_file(robot: str) -> str:
+    """Return the name of a robot's file with a result in it."""
+    path = Path(robot)
+    return f"{path.stem}_found{path.suffix}"
 
 
 def let_go(robot: str) -> dict[str, Any]:

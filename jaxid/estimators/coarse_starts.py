@@ -48,18 +48,18 @@ def coarse_starts(
     if points is None:
         return [machine.parameters.guess]
     if len(parts) == 1:
-        costs = _costs_along(parts[0], numerics[0], points[1:])
+        costs = costs_along(parts[0], numerics[0], points[1:])
         best = np.argsort(costs, kind="stable")[:count]
         return [points[0], *points[1 + best]]
 
     fastest = int(np.argmax([_speed(part) for part in parts]))
-    ranked = np.argsort(_costs_along(parts[fastest], numerics[fastest], points), kind="stable")
+    ranked = np.argsort(costs_along(parts[fastest], numerics[fastest], points), kind="stable")
     # The guesses stay in any case.
     kept = points[np.unique(np.append(ranked[: _FINALISTS - 1], 0))]
     signals = [float(np.linalg.norm(part.log.filled - part.log.filled.mean(axis=0))) for part in parts]
     weights = start_weights(signals, [part.log.filled.size for part in parts])
     logs = zip(weights, parts, numerics, strict=True)
-    costs = np.sum([weight * _costs_along(part, stated, kept) for weight, part, stated in logs], axis=0)
+    costs = np.sum([weight * costs_along(part, stated, kept) for weight, part, stated in logs], axis=0)
     return list(kept[np.argsort(costs, kind="stable")[: count + 1]])
 
 
@@ -88,21 +88,28 @@ def _speed(part: Part) -> float:
     return float(np.max(np.sqrt(np.mean(np.diff(q, axis=0) ** 2, axis=0)) / spread) / part.log.period)
 
 
-def _costs_along(
-    part: Part, numerics: Numerics, points: Float[np.ndarray, "points p"]
+def costs_along(
+    part: Part, numerics: Numerics, points: Float[np.ndarray, "points p"], lanes: int = _LANES
 ) -> Float[np.ndarray, " points"]:
-    """Return the squared residual of a log at each point; infinite where the loop diverges."""
+    """Return the squared residual of a log at each point; infinite where the loop diverges.
+
+    Args:
+        part: The log.
+        numerics: Settings of the integration.
+        points: Values of the unknowns of all logs, (points, p).
+        lanes: Points in a compiled call.
+    """
     machine, log, own = part.machine, part.log, points[:, part.index]
     replay = make_replay(machine, log, numerics)
     measured = jnp.asarray(log.filled)
     weight = jnp.asarray(np.array(log.measured, float)) * jnp.ones(measured.shape)
-    lanes = -(-len(own) // _LANES) * _LANES
+    whole = -(-len(own) // lanes) * lanes
     # Whole calls, so that one shape of compiled code serves them.
-    filled = own[np.minimum(np.arange(lanes), len(own) - 1)]
+    filled = own[np.minimum(np.arange(whole), len(own) - 1)]
     places, plant = machine.parameters.places, machine.plant
     costs = [
-        np.asarray(_costs(replay, places, plant, measured, weight, filled[k : k + _LANES]))
-        for k in range(0, lanes, _LANES)
+        np.asarray(_costs(replay, places, plant, measured, weight, filled[k : k + lanes]))
+        for k in range(0, whole, lanes)
     ]
     return np.nan_to_num(np.concatenate(costs)[: len(own)], nan=np.inf)
 

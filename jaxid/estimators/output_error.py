@@ -286,12 +286,14 @@ class _Fit:
         outputs: The outputs that are compared.
         on: Kind of the outputs, one of `jaxid.names.OUTPUTS`.
         minimiser: A solver of optimistix for one log, or its name; None: jaxid's.
+        tolerance: Part of the cost by which a fit of several logs has converged.
     """
 
     machine: Machine
     outputs: tuple[_Output, ...]
     on: str
     minimiser: str | Minimiser | None = None
+    tolerance: float = _TOLERANCE
 
     @property
     def unknowns(self) -> int:
@@ -380,7 +382,7 @@ class _Fit:
                 logs = yield from self._rows(theta, starts, signals, weights)
                 return summed(logs, scale.slope(theta))
 
-            options = {"tolerance": (_TOLERANCE, 0.0), "max_steps": _MOST, "active": active}
+            options = {"tolerance": (self.tolerance, 0.0), "max_steps": _MOST, "active": active}
             return (yield from descent_steps(evaluate, x, scale.bounds, **options))
 
         x = scale.inward(theta, starts)
@@ -468,6 +470,7 @@ def output_error_steps(
     on: str = "position",
     minimiser: str | Minimiser | None = None,
     noise: ReadingNoise | None = None,
+    tolerance: float = _TOLERANCE,
 ) -> Steps[Estimate]:
     """Run `output_error` as a generator of solve requests.
 
@@ -478,6 +481,7 @@ def output_error_steps(
         solver: One of `jaxid.names.SOLVERS` for the chosen settings of the integration; None: fixed steps.
         noise: Noise of the encoder that the loop of a log alone is simulated with, whose mean readings are
             then compared; None: it is simulated without noise.
+        tolerance: Part of the cost by which a fit of several logs has converged.
 
     Raises:
         InputError: Those of `output_error`; or a profile or a minimiser is asked for with several logs.
@@ -498,7 +502,7 @@ def output_error_steps(
         parts = [replace(part, machine=part.at(start)) for part in parts]
 
     first = "position" if on == "both" else on
-    fit = _Fit(machine, _outputs(parts, numerics, solver, first, noise), first, minimiser)
+    fit = _Fit(machine, _outputs(parts, numerics, solver, first, noise), first, minimiser, tolerance)
     theta = machine.parameters.guess
     if machine.unknown_reference is not None:
         # With a wrong reference the machine's parameters would diverge: fit the reference's unknowns first.

@@ -16,6 +16,8 @@ from jaxtyping import Float
 
 from jaxid.consistency.absent import without_scale
 from jaxid.controllers.linear import PD, PID, CascadePD
+from jaxid.estimators.apart.joint import stands_apart
+from jaxid.estimators.apart.steps import apart_steps
 from jaxid.estimators.coarse_starts import coarse_starts
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import output_error_steps
@@ -44,12 +46,16 @@ _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
 def unforced_steps(session: Session, *, numerics: Numerics | None = None, **options: Any) -> Steps[Estimate]:
     """Fit the positions of loops whose force was not logged, from several starts, to one log or to several.
 
+    The joints of an arm are fitted one by one if each has a servo, see `jaxid.estimators.apart`.
+
     Args:
         session: Case and logs of the fit.
         numerics: Settings of the integration; None: chosen from machine and log.
         options: Further arguments of `output_error_steps`.
     """
     machine = session.machine
+    if stands_apart(machine, parts_of(session)):
+        return (yield from apart_steps(machine, parts_of(session), numerics=numerics, **options))
     group = common_scale_group(machine, parts_of(session))
     base = base_of(machine, group) if group else None
     fitted = machine if base is None else without(machine, base)
@@ -104,8 +110,8 @@ def scale_group(machine: Machine, log: Log) -> tuple[int, ...]:
     """
     law = machine.controller
     names = _gains(machine)
-    if names is None or machine.disturbance is not None:
-        # Another law is not linear in its gains, and a disturbance is a known force.
+    if names is None or machine.disturbance is not None or machine.load is not None:
+        # Another law is not linear in its gains; a disturbance and a load are known forces.
         return ()
     free = machine.parameters.free
     unknown = _of_controller(machine)

@@ -106,7 +106,7 @@ def replay_export(
     replay, position = _simulated(found, measured)
 
     def robot(content: bytes, added: tuple[str, ...] = ()) -> MujocoRobot:
-        return _robot(content, path, model, case, found, added)
+        return mujoco_robot(content, path, model, case, found, added)
 
     ours, theirs = robot(exported.content, exported.added), robot(path.read_bytes())
     motion, before = ours.motion(replay), theirs.motion(replay)
@@ -116,10 +116,10 @@ def replay_export(
     return Replayed(
         joints=tuple(model["joints"]),
         units=tuple(machine.unit("position", k) for k in range(len(model["joints"]))),
-        before=_rms(measured.position - before),
-        after=_rms(measured.position - motion),
-        own=_rms(measured.position - position),
-        difference=_rms(motion - position),
+        before=rms(measured.position - before),
+        after=rms(measured.position - motion),
+        own=rms(measured.position - position),
+        difference=rms(motion - position),
         costs=tuple(_costs(model, exported, found, measured, position, ours, replay, motion)),
         closed=replay.controller is not None,
         stretch=_STRETCH,
@@ -152,7 +152,7 @@ def _simulated(machine: Machine, log: Log) -> tuple[Replay, np.ndarray]:
     return replay, position
 
 
-def _robot(
+def mujoco_robot(
     content: bytes,
     path: Path,
     model: Mapping[str, Any],
@@ -191,16 +191,17 @@ def _costs(
             changed = _simulated(less, log)[1]
         except InputError:
             continue
-        yield f"without {shown(model['effects'][number])}", _rms(changed - position)
+        yield f"without {shown(model['effects'][number])}", rms(changed - position)
     for name in exported.added:
         stiff = robot.motion(replay, Setting(locked=(name,)))
-        yield f"without the second joint '{name}'", _rms(stiff - motion)
+        yield f"without the second joint '{name}'", rms(stiff - motion)
     fine = robot.motion(replay, Setting(finer=_FINER))
-    yield f"time step of {robot.model.opt.timestep:g} s, against a {_FINER}th", _rms(fine - motion)
+    yield f"time step of {robot.model.opt.timestep:g} s, against a {_FINER}th", rms(fine - motion)
     if np.any(robot.model.dof_frictionloss > 0):
         stiff = robot.motion(replay, Setting(finer=_FINER, stiff=True))
-        yield "soft dry friction (solreffriction), against stiff", _rms(stiff - fine)
+        yield "soft dry friction (solreffriction), against stiff", rms(stiff - fine)
 
 
-def _rms(off: np.ndarray) -> Float[np.ndarray, " n"]:
+def rms(off: np.ndarray) -> Float[np.ndarray, " n"]:
+    """Return the root mean square of each column, (n,); a missing reading is NaN."""
     return np.sqrt(np.nanmean(off**2, axis=0))

@@ -147,9 +147,14 @@ class Draft:
             )
 
         table = self._log_table(names)
+        if not chosen.force:
+            # Between two rows of a log a servo keeps the command that it was sent last.
+            table.keys["reference_hold"] = "zero_order"
+            table.assumed.append("each command holds until the next one")
         motions = {joint.name: "rotary" if joint.motion == "revolute" else "linear" for joint in robot.joints}
         self._motions = tuple(motions[name] for name in names)
-        return [plant, table, *self._sensor(self._read(table))]
+        log = self._read(table)
+        return [plant, table, *(self._sensor(log) if chosen.force else self._sensor_of_servos(log))]
 
     def without_force(self) -> list[Section]:
         """Return the case of a servo that follows its reference, or of a free swing under its weight."""
@@ -359,6 +364,19 @@ class Draft:
                 section.keys["position_noise"] = _one(beyond)
                 section.notes["position_noise"] = f"{unit}, beyond the rounding, from its highest frequencies"
         return [section] if section.keys else []
+
+    def _sensor_of_servos(self, log: Log) -> list[Section]:
+        """Return [sensor] for servos of a robot's file, which read their joints exactly, as in MuJoCo."""
+        if log.resampled:
+            return []
+        counts = np.array([self._count(column) for column in self._chosen.position])
+        noise = np.maximum(np.atleast_1d(high_band_std(log.position)), counts / np.sqrt(12))
+        if not np.all(noise > 0):
+            return []
+        unit = self._units().label("position")
+        said = f"{unit}, counts included: the servos of the file read their joints exactly"
+        values = _one([rounded(float(x)) for x in noise])
+        return [Section("[sensor]", {"position_noise": values}, {"position_noise": said})]
 
     def _count(self, column: Column) -> float:
         """Return the step between the positions of a column, in the unit of results; 0 if there is none."""

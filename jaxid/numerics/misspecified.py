@@ -112,6 +112,9 @@ def block_covariance(
         counts: Mask of the samples that count, (time, n).
         edges: First sample of each block but the first, ascending, (blocks - 1,).
 
+    Returns:
+        The covariance; NaN if the Jacobian overflows.
+
     Source:
         White (1982), Econometrica 50, 1-25, for estimates of incomplete models; Kunsch (1989), Annals of
         Statistics 17, for blocks of dependent samples; Bell and McCaffrey (2002), Survey Methodology 28,
@@ -128,6 +131,9 @@ def block_covariance(
     size = np.sqrt(np.diag(whole))
     size = np.where(size > 0, size, 1.0)
     scaled = [(whole - own) / np.outer(size, size) for own in normals]
+    if not (np.all(np.isfinite(scaled)) and np.all(np.isfinite(scores))):
+        # The derivatives of a loop that is not stable overflow, and say nothing.
+        return np.full((p, p), np.nan)
     steps = np.stack([_solved(normal, score / size) for normal, score in zip(scaled, scores, strict=True)])
     steps = np.sqrt(1 - 1 / len(steps)) * (steps - steps.mean(axis=0))
     return steps.T @ steps / np.outer(size, size)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.files import found_case_file, json_text, signal_csv, write_results
-from jaxid.model.unknowns import leaf, several_places
+from jaxid.model.unknowns import in_loop, leaf, several_places
 from jaxid.results.found_case import case_text, changed_in_python
 from jaxid.results.model_json import joint_name, model_json
 from jaxid.results.parameters import Covariance
@@ -66,7 +66,7 @@ def parameters_json(
             "identifiable": bool(identifiable),
             **{key: float(s[k]) if identifiable and np.isfinite(s[k]) else None for key, s in more.items()},
         }
-        if f.index is None:
+        if f.index is None or in_loop(f.path):
             out[f.name] = entry
             continue
         listed = out.setdefault(_key(f), _known(np.asarray(leaf(plant, f.path)), f.unit))
@@ -93,7 +93,7 @@ def _add_of_log(out: dict[str, Any], f: Free, value: float, std: float, identifi
 
 def _key(f: Free) -> str:
     """Return the key of an unknown in results: its name, or that of the plant's list in which it is."""
-    return f.name if f.index is None else str(f.path[0])
+    return f.name if f.index is None or in_loop(f.path) else str(f.path[0])
 
 
 def _known(values: np.ndarray, unit: str) -> dict[str, Any]:

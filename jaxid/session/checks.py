@@ -28,7 +28,10 @@ def log_findings(case: Case, log: Log, machine: Machine, short: bool, *, alone: 
     units, plant = machine.units, machine.plant
     motions = [plant.motion(j) or units.motion for j in range(plant.joints)]
     driven = np.asarray(plant.at_drives(np.arange(plant.joints)))
-    stated = machine.sensor.position_resolution is not None
+    sensor = machine.sensor
+    # A log without a force is compared by its positions, whose noise may be stated with the counts in it.
+    stated = sensor.position_resolution is not None
+    stated = stated or (sensor.position_noise is not None and machine.unforced(log))
     findings = check_log(
         log,
         command_limit=limit,

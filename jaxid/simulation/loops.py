@@ -192,6 +192,7 @@ def closed_loop(
     velocity: Float[Array, " n"],
     sensor: Sensor | None = None,
     noise: Float[Array, "ticks n"] | None = None,
+    load: Float[Array, "ticks m"] | None = None,
 ) -> Trajectory:
     """Simulate a plant in its sampled loop.
 
@@ -205,6 +206,7 @@ def closed_loop(
         sensor: Sensor that the controller reads; None: exact readings.
         noise: Standard normal numbers for the noise of the positions and, if there are more
             columns, of the measured commands and the inertial sensors; None: no noise.
+        load: Known force beside that of the drives, held over each tick [N or N m]; None: there is none.
 
     Returns:
         The trajectory, one row per tick.
@@ -237,7 +239,7 @@ def closed_loop(
 
     def tick(carry: tuple, now: tuple) -> tuple[tuple, tuple]:
         x, memory, past, last, held, moved = carry
-        path, disturbance, noise, t, fresh, renews = now
+        path, disturbance, noise, t, fresh, renews, beside = now
         reading = sensor.read(x.q, None if noise is None else noise[:n])
         if fresh is not None:
             reading = held = jnp.where(fresh, reading, held)
@@ -248,6 +250,8 @@ def closed_loop(
         seen = Tick(reading, path, driven, True if fresh is None else fresh, v, a, last, renewed)
         u, memory = controller.command(seen, memory, disturbance)
         ends, past = _delayed_force(plant, drive, u, past)
+        if beside is not None:
+            ends = tuple(force + beside for force in ends)
         new = advance(x, ends, t)
         if last is not None:
             assert noise is not None, "a command is measured only with noise"
@@ -259,7 +263,7 @@ def closed_loop(
     last, held = held / drive.gain if measures else None, None if fresh is None else position
     moved = None if inertial is None else (velocity, velocity, jnp.zeros_like(velocity))
     renews = None if inertial is None else jnp.arange(len(times)) % inertial.hold == 0
-    inputs = (path, disturbance, noise, times, fresh, renews)
+    inputs = (path, disturbance, noise, times, fresh, renews, load)
     _, (q, v, u, reading, found) = jax.lax.scan(tick, (x0, memory, past, last, held, moved), inputs)
     return Trajectory(q, v, u, reading, found)
 

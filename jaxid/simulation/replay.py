@@ -82,6 +82,7 @@ class Replay(eqx.Module):
         restart: Flags, positions and velocities of segments (open loop).
         every: Number of ticks per sample of the log.
         follow: Matrix from positions of joints with an encoder to positions of all at rest, (n, k).
+        load: Known force beside that of the drives at every tick (closed loop); None: there is none.
     """
 
     drive: Drive
@@ -95,6 +96,7 @@ class Replay(eqx.Module):
     restart: tuple[Array, Array, Array] | None
     every: int = eqx.field(static=True)
     follow: Float[Array, "n k"]
+    load: Array | None = eqx.field(default=None, kw_only=True)
 
     def __call__(
         self, plant: Plant, nudge: Array | None = None, noise: Float[Array, "ticks n"] | None = None
@@ -123,6 +125,7 @@ class Replay(eqx.Module):
                 v,
                 self.sensor,
                 noise,
+                self.load,
             )
         else:
             assert self.command is not None, "make_replay gives an open loop its command"
@@ -198,7 +201,13 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
         None,
         every,
         follow,
+        load=_load_at(machine, log, times + 0.5 * period),
     )
+
+
+def _load_at(machine: Machine, log: Log, times: np.ndarray) -> np.ndarray | None:
+    """Return the known load of a machine at some times, (times, m); None if there is none."""
+    return None if machine.load is None else reference_at(log.time, machine.load, times, "linear")
 
 
 def _in_motion(machine: Machine, log: Log, every: int, disturbance: np.ndarray | Array) -> Controller:

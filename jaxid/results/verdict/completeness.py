@@ -36,6 +36,8 @@ _FEWEST = 20
 # Excess of the cumulated periodogram over a white one that counts, as a part of the power: on the fitted log,
 # and on others, whose residual also holds the error of the parameters.
 _EXCESS, _EXCESS_ELSEWHERE = 0.05, 0.1
+# Factor in RMS over the noise of an encoder beyond which its effect in a loop, half of it, decides nothing.
+_NEAR = 3.0
 # Probability that the periodogram of white noise exceeds the limit; there is one test for each joint and log.
 _RARELY = 1e-3
 # Factor in RMS by which a residual of the right colour may exceed the noise, which is known to a few tenths,
@@ -161,6 +163,15 @@ def _of_rows(machine: Machine, run: OpenedLog, gap: ForceGap, joint: int, *, fit
     return Residual(run.name, joint, fits, rms, floor)
 
 
+def _noise_shows(machine: Machine, run: OpenedLog, gap: SimulationGap, floor: np.ndarray) -> bool:
+    """Check that noise in the loop, which moves a position by half of it, could decide a residual.
+
+    Along an arm of many joints a run with each draw of noise takes minutes.
+    """
+    near = gap.rms <= _NEAR * floor
+    return bool(np.any(near[list(run.log.measured)])) and machine.plant.filters_fast
+
+
 def position_residuals(
     machine: Machine, run: OpenedLog, gap: SimulationGap | None, *, fitted: bool = True
 ) -> list[Residual]:
@@ -186,7 +197,7 @@ def position_residuals(
 
     least = _EXCESS if fitted else _EXCESS_ELSEWHERE
     simulated = gap.position
-    if machine.unforced(run.log):
+    if machine.unforced(run.log) and _noise_shows(machine, run, gap, floor):
         numerics = choose_numerics(machine, run.log)
         expected = mean_readings(machine, run.log, make_replay(machine, run.log, numerics))
         simulated = gap.position if expected is None else expected

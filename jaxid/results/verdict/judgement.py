@@ -235,7 +235,8 @@ def _completeness_words(
         "machine's may differ by more."
     )
     lines += _loop_words(session)
-    if search == "none":
+    machine = session.machine
+    if search == "none" and not (machine.unforced(session.fit.log) and machine.plant.coupled):
         lines.append("The command jaxid discover searches for what is missing.")
     return lines
 

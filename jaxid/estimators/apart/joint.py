@@ -1,0 +1,250 @@
+"""A joint of an arm in its loop, with the forces of the links along the motion that was measured.
+
+In the loop of a servo a joint follows its command closely, and so do all others. The force of the links on
+it then hardly differs from that along the measured motion, which the links' parameters give. With that force
+as a known load the joint is an axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.arrays import Array
+from jaxid.controllers import Controller
+from jaxid.controllers.linear import PD, CascadePD
+from jaxid.estimators.several.parts import Part
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
+from jaxid.machine import Machine
+from jaxid.model.unknowns import CONTROLLER, Free, Parameters
+from jaxid.numerics.kept import kept_jit
+from jaxid.plants.axis import Axis
+from jaxid.plants.link_tree import LinkTree
+from jaxid.sensors.encoder import Sensor
+
+# Unknown inertias of the rotors among the parameters of a tree.
+_ROTOR = "rotor_inertia"
+# Most rows at which a joint's own inertia is evaluated for its mean.
+_ROWS = 200
+
+
+@dataclass(frozen=True)
+class JointAlone:
+    """A joint of an arm, along the logs of a fit.
+
+    Args:
+        joint: Its number, from 0.
+        machine: Machine of the joint with its unknowns of all logs; its load is that of the first.
+        parts: The logs with their machines and loads.
+        index: Number of each of its unknowns among those of the arm, (own,).
+        links: Mean inertia of the links about the joint [kg m^2 or kg], a part of its machine's.
+        ratio: Inertia at the joint for one of its rotor, the square of its gear.
+    """
+
+    joint: int
+    machine: Machine
+    parts: tuple[Part, ...]
+    index: np.ndarray
+    links: float
+    ratio: float
+
+    def of_arm(self, own: Float[np.ndarray, " own"]) -> Float[np.ndarray, " own"]:
+        """Return values of the joint's unknowns as those of the arm: a rotor without the links."""
+        return np.where(self._inertias, (own - self.links) / self.ratio, own)
+
+    @property
+    def slope(self) -> Float[np.ndarray, " own"]:
+        """Derivative of the arm's values by those of the joint."""
+        return np.where(self._inertias, 1.0 / self.ratio, 1.0)
+
+    @property
+    def _inertias(self) -> np.ndarray:
+        return np.array([f.path == ("inertia",) for f in self.machine.parameters.free], dtype=bool)
+
+    @property
+    def moves(self) -> bool:
+        """True if the reference of the joint moves in any log."""
+        return any(part.log.reference is not None and np.ptp(part.log.reference) > 0 for part in self.parts)
+
+
+def stands_apart(machine: Machine, parts: Sequence[Part]) -> bool:
+    """Check that every joint of a machine can be fitted alone.
+
+    It is an arm of several joints whose positions were all measured, each with a servo, and no unknown
+    belongs to several joints.
+
+    Args:
+        machine: Machine of all logs.
+        parts: The logs.
+    """
+    plant, law = machine.plant, machine.controller
+    if not isinstance(plant, LinkTree) or plant.joints < 2 or type(law) not in (PD, CascadePD):
+        return False
+    if len(plant.driven(plant.joints)) < plant.joints or plant.shafts or machine.parameters.bodies:
+        return False
+    # A load would pass through an effect in the drive, or an effect that reads the force of the drive.
+    if any((e.in_drive or e.needs_drive) and e.controller_field is None for e in plant.effects):
+        return False
+    if any(_joint_of(f, machine) is None or f.log is not None for f in machine.parameters.free):
+        return False
+    several = [part.log.reference is not None and part.log.reference.shape[1] > 1 for part in parts]
+    usual = [part.machine.disturbance is None and part.machine.unforced(part.log) for part in parts]
+    return all(all(part.log.measured) and not part.log.integrated for part in parts) and all(several + usual)
+
+
+def joints_alone(machine: Machine, parts: Sequence[Part]) -> list[JointAlone]:
+    """Return every joint of an arm that has unknowns, with its load along each log.
+
+    Args:
+        machine: Machine of all logs, which `stands_apart`.
+        parts: The logs.
+    """
+    loads, inertias = [], []
+    for part in parts:
+        force, own = _of_links(_links(part.machine), *(getattr(part.data, n) for n in ("q", "qd", "qdd")))
+        loads.append(np.asarray(force))
+        inertias.append(np.asarray(own))
+    means = np.mean(np.concatenate(inertias), axis=0)
+    names = machine.parameters.names
+    out = []
+    for joint in range(machine.plant.joints):
+        own = [
+            n for n, f in zip(names, machine.parameters.free, strict=True) if _joint_of(f, machine) == joint
+        ]
+        if not own:
+            continue
+        alone = []
+        for part, load in zip(parts, loads, strict=True):
+            # The force of the links beyond that of the constant inertia of the axis.
+            beside = means[joint] * part.data.qdd[:, joint] - load[:, joint]
+            one = _machine(part.machine, joint, means[joint], beside)
+            index = np.array([own.index(name) for name in one.parameters.names], dtype=int)
+            alone.append(Part(part.name, _log(part, joint), one, index, _prepared(part.data, joint)))
+        whole = _machine(machine, joint, means[joint], alone[0].machine.load)
+        index = np.array([names.index(name) for name in own])
+        ratio = float(_ratios(machine.plant)[joint])
+        out.append(JointAlone(joint, whole, tuple(alone), index, float(means[joint]), ratio))
+    return out
+
+
+def _joint_of(f: Free, machine: Machine) -> int | None:
+    """Return the only joint to which an unknown of an arm belongs; None if there is none."""
+    plant = machine.plant
+    if f.effect is not None:
+        port = plant.effects[f.effect].port
+        return port if port < plant.joints else None
+    if f.path[0] == CONTROLLER:
+        return plant.driven(plant.joints)[f.index] if isinstance(f.index, int) else None
+    return f.index if f.path == (_ROTOR,) and isinstance(f.index, int) else None
+
+
+def _links(machine: Machine) -> LinkTree:
+    """Return the links of an arm alone."""
+    assert isinstance(machine.plant, LinkTree), "checked by stands_apart"
+    return replace(machine.plant, effects=(), rotor_inertia=None)
+
+
+def _ratios(plant: Any) -> np.ndarray:
+    """Return the square of each joint's gear ratio."""
+    return np.ones(plant.joints) if plant.gear_ratio is None else np.asarray(plant.gear_ratio) ** 2
+
+
+@kept_jit
+def _of_links(plant: LinkTree, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
+    """Return the forces of the links along a motion, (time, n), and inertias of joints at some rows."""
+    every = max(1, len(q) // _ROWS)
+    zero = jnp.zeros(q.shape[1])
+
+    def own(q: Array) -> Array:
+        return jnp.diagonal(jax.jacfwd(lambda a: plant.inertial(q, zero, a))(zero))
+
+    return jax.vmap(plant.inertial)(q, qd, qdd), jax.lax.map(own, q[::every])
+
+
+def _machine(machine: Machine, joint: int, links: float, load: Any) -> Machine:
+    """Return the machine of a joint, with its unknowns, whose links have a constant inertia."""
+    plant, law = machine.plant, machine.controller
+    assert isinstance(plant, LinkTree), "checked by stands_apart"
+    assert law is not None, "checked by stands_apart"
+    drive = plant.driven(plant.joints).index(joint)
+    ratio, rotors = _ratios(plant)[joint], plant.rotor_inertia
+    rotor = 0.0 if rotors is None else ratio * float(np.asarray(rotors)[joint])
+
+    numbers = [k for k, e in enumerate(plant.effects) if e.port == joint]
+    effects = tuple(replace(plant.effects[k], port=0) for k in numbers)
+    scale = plant.smoothing.velocity_scale
+    smoothing = replace(plant.smoothing, velocity_scale=scale if np.ndim(scale) == 0 else scale[joint])
+    free = [
+        _free(f, numbers, links, ratio) for f in machine.parameters.free if _joint_of(f, machine) == joint
+    ]
+    return replace(
+        machine,
+        plant=Axis(jnp.asarray(links + rotor), effects=effects, smoothing=smoothing),
+        parameters=Parameters(tuple(free)),
+        gain=np.asarray(machine.gain)[drive : drive + 1],
+        controller=_law(law, drive, len(machine.gain)),
+        sensor=_sensor(machine.sensor, joint, plant.joints),
+        load=None if load is None else np.reshape(load, (-1, 1)),
+    )
+
+
+def _free(f: Free, effects: list[int], links: float, ratio: float) -> Free:
+    """Return an unknown of an arm as one of its joint alone."""
+    if f.effect is not None:
+        return replace(f, path=("effects", effects.index(f.effect), *f.path[2:]))
+    if f.path[0] == CONTROLLER:
+        return replace(f, index=0)
+    ends = (links + ratio * max(f.lower, 0.0), links + ratio * f.upper)
+    guess = links + ratio * f.guess
+    return replace(
+        f, path=("inertia",), index=None, sign="positive", guess=guess, lower=ends[0], upper=ends[1]
+    )
+
+
+def _law(law: Controller, drive: int, drives: int) -> Controller:
+    """Return the law of one drive."""
+    own = {f.name: getattr(law, f.name) for f in fields(law)}
+    lists = {name: value for name, value in own.items() if np.ndim(value) == 1 and len(value) == drives}
+    return replace(law, **{name: np.asarray(value)[drive : drive + 1] for name, value in lists.items()})
+
+
+def _sensor(sensor: Sensor, joint: int, joints: int) -> Sensor:
+    """Return the encoder of one joint."""
+
+    def of(x: Any) -> Any:
+        return x if np.ndim(x) == 0 or len(x) != joints else np.asarray(x)[joint : joint + 1]
+
+    return Sensor(of(sensor.position_resolution), of(sensor.position_noise), hold=sensor.hold)
+
+
+def _log(part: Part, joint: int) -> Log:
+    """Return the columns of one joint of a log without a force."""
+    log, drive = part.log, part.machine.plant.driven(part.machine.plant.joints).index(joint)
+    assert log.reference is not None, "checked by stands_apart"
+    return Log(
+        log.time,
+        log.position[:, joint],
+        np.zeros(log.samples),
+        reference=log.reference[:, drive],
+        rows=log.rows,
+        source=log.source,
+        assumed=log.assumed,
+        table=log.table,
+    )
+
+
+def _prepared(data: Prepared, joint: int) -> Prepared:
+    """Return the filtered motion of one joint."""
+
+    def of(x: np.ndarray) -> np.ndarray:
+        return x[:, joint : joint + 1]
+
+    motion = {name: of(getattr(data, name)) for name in ("q", "qd", "qdd", "moving", "fitted")}
+    return replace(data, **motion, force=np.zeros_like(motion["q"]), measured=(True,), force_noise=None)

@@ -1,0 +1,213 @@
+"""Starts of a fit of a servo's joint, by a balance that is linear in the reciprocal of its gain.
+
+With the law u = kp (r - q) - kd dq the error of the position is
+
+    r - q = (J ddq - load) / kp + (kd + c) / kp dq + F / kp sign(dq)
+
+in which only the delay of the reference r is not linear. Errors of the encoder are small beside the error of
+the position, and nothing has to be near the truth: a gain of the file may be wrong by a factor of fifty.
+Where a joint carries little, the accelerations alone hardly show the gain. So some gains are tried too, each
+with the friction that fits it best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+from jaxtyping import Float
+
+from jaxid.controllers.linear import CascadePD
+from jaxid.estimators.apart.joint import JointAlone
+from jaxid.machine import Machine
+from jaxid.model.unknowns import CONTROLLER
+
+# Delays that are tried, if the delay is unknown [s].
+_DELAYS = np.arange(0.0, 0.205, 0.005)
+# Gains that are tried, as parts of the guess.
+_GAINS = (1 / 300, 1 / 100, 1 / 30, 1 / 10, 1 / 3, 1.0)
+# Largest factor by which a start may differ from the guess.
+_FARTHEST = 1e3
+# Part of the guess at which a friction starts that the balance does not show.
+_LITTLE = 1e-2
+# Part of the spread of the velocity from which a joint counts as moving, and the fewest such rows.
+_MOVING, _FEWEST = 0.2, 10
+
+
+def starts_by_balance(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
+    """Return values of a joint's unknowns by the balance of its servo, the one with the best gain first.
+
+    Unknowns that do not enter the balance stay at their guesses.
+
+    Args:
+        alone: The joint, with its logs.
+    """
+    machine = alone.machine
+    unknown = {_role(f.path, machine): k for k, f in enumerate(machine.parameters.free)}
+    if "kp" not in unknown:
+        return []
+    balance = _Balance.of(alone)
+    if balance is None:
+        return []
+    delays = range(len(_DELAYS)) if "delay" in unknown else [_nearest(_delay(machine))]
+    starts = [_start(machine, unknown, found) for found in balance.solutions(delays, _stiffness(machine))]
+    return [start for start in starts if is_stable(machine.with_estimate(start))]
+
+
+def is_stable(machine: Machine) -> bool:
+    """Check that the sampled loop of a joint, without its delay and dry friction, comes to rest.
+
+    A loop that does not may still end near the log, in a small vibration between the limits of its force, and
+    its derivatives grow without bound.
+    """
+    law, inertia = machine.controller, float(np.asarray(machine.plant.own_inertia()))
+    assert law is not None, "checked by stands_apart"
+    known = _damping(machine)
+    # State and held force over one period: d/dt (q, v, u) = (v, (u - c v) / J, 0).
+    rates = np.array([[0, 1, 0], [0, -known["viscous"] / inertia, 1 / inertia], [0, 0, 0]], dtype=float)
+    over = scipy.linalg.expm(rates * law.period)
+    closed = over[:2, :2] - np.outer(over[:2, 2], [_stiffness(machine), known["kd"]])
+    return bool(np.max(np.abs(np.linalg.eigvals(closed))) < 1.0)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Reciprocal of the gain, damping and dry friction over the gain, and the delay."""
+
+    compliance: float
+    lag: float
+    dry: float
+    delay: float
+
+
+@dataclass(frozen=True)
+class _Balance:
+    """The balance at all rows in motion, reduced to a triangular matrix.
+
+    Args:
+        matrix: Coefficients of the three unknowns, (3, 3).
+        errors: Reduced error of the position by delay, (delays, 3).
+        rest: Norm of what no value explains, by delay, (delays,).
+    """
+
+    matrix: Float[np.ndarray, "3 3"]
+    errors: Float[np.ndarray, "delays 3"]
+    rest: Float[np.ndarray, " delays"]
+
+    @classmethod
+    def of(cls, alone: JointAlone) -> _Balance | None:
+        """Return the balance along all logs of a joint; None if it hardly moves."""
+        rows, errors = [], []
+        for part in alone.parts:
+            log, machine = part.log, part.machine
+            assert log.reference is not None, "checked by stands_apart"
+            assert machine.load is not None, "a joint alone has one"
+            q, v, a = (x[:, 0] for x in (part.data.q, part.data.qd, part.data.qdd))
+            force = float(np.asarray(machine.plant.own_inertia())) * a - machine.load[:, 0]
+            # Of rest the balance says no more than an interval for dry friction.
+            counts = np.abs(v) > _MOVING * np.std(v)
+            counts &= log.time > log.time[0] + _DELAYS[-1]
+            late = [np.interp(log.time[counts] - d, log.time, log.reference[:, 0]) for d in _DELAYS]
+            rows.append(np.stack([force, v, np.sign(v)], axis=1)[counts])
+            errors.append(np.stack(late) - q[counts])
+        matrix, error = np.concatenate(rows), np.concatenate(errors, axis=1)
+        if len(matrix) < _FEWEST:
+            return None
+        basis, triangle = np.linalg.qr(matrix)
+        inside = error @ basis
+        rest = np.sum(error**2, axis=1) - np.sum(inside**2, axis=1)
+        return cls(triangle, inside, np.sqrt(np.maximum(rest, 0.0)))
+
+    def solutions(self, delays: range | list[int], stiffness: float) -> Iterator[_Found]:
+        """Return the best values at any gain, and those at some gains about a guess."""
+        best = self._best(delays, None)
+        if best.compliance > 0:
+            yield best
+        for part in _GAINS:
+            yield self._best(delays, 1.0 / (part * stiffness))
+
+    def _best(self, delays: range | list[int], compliance: float | None) -> _Found:
+        found = [self._at(k, compliance) for k in delays]
+        return min(found, key=lambda one: one[1])[0]
+
+    def _at(self, delay: int, compliance: float | None) -> tuple[_Found, float]:
+        """Return the values at a delay, and the misfit; a gain may be given."""
+        free = self.matrix if compliance is None else self.matrix[:, 1:]
+        error = self.errors[delay] - (0.0 if compliance is None else compliance * self.matrix[:, 0])
+        size = np.maximum(np.linalg.norm(free, axis=0), 1e-300)
+        values, misfit = scipy.optimize.nnls(free / size, error)
+        values = values / size
+        if compliance is not None:
+            values = np.append(compliance, values)
+        inverse, lag, dry = (float(x) for x in values)
+        found = _Found(inverse, lag, dry, float(_DELAYS[delay]))
+        return found, float(np.hypot(misfit, self.rest[delay]))
+
+
+def _start(machine: Machine, unknown: dict[str, int], found: _Found) -> Float[np.ndarray, " own"]:
+    """Return values of the unknowns for a solution of the balance."""
+    stiffness, drive = 1.0 / found.compliance, float(np.abs(machine.gain[0]))
+    damping, known = found.lag * stiffness, _damping(machine)
+    free = [name for name in ("kd", "viscous") if name in unknown]
+    # Both dampings act alike: their guesses divide the sum that was found.
+    spare = max(damping - sum(v for n, v in known.items() if n not in free), _LITTLE * damping)
+    weights = {n: max(known[n], 1e-12) for n in free}
+    values = {n: spare * weights[n] / sum(weights.values()) for n in free}
+    values |= {"kp": stiffness / drive, "dry": found.dry * stiffness, "delay": found.delay}
+    if "kd" in free:
+        values["kd"] /= drive
+    if isinstance(machine.controller, CascadePD):
+        # Its gain of the position multiplies that of the velocity.
+        values["kp"] /= max(values.get("kd", known["kd"] / drive), 1e-12)
+
+    start, guess = machine.parameters.guess, machine.parameters.guess
+    for name, value in values.items():
+        k = unknown.get(name)
+        if k is None:
+            continue
+        size = abs(guess[k]) if guess[k] else max(abs(value), 1e-12)
+        least = 0.0 if name == "delay" else _LITTLE * size / _FARTHEST
+        start[k] = np.clip(value, least, _FARTHEST * size)
+    return np.clip(start, *machine.parameters.bounds)
+
+
+def _role(path: tuple[str | int, ...], machine: Machine) -> str:
+    """Return the part that an unknown has in the balance; its own name if it has none."""
+    if path[0] == CONTROLLER:
+        name = str(path[1])
+        return "kd" if isinstance(machine.controller, CascadePD) and name == "kv" else name
+    if path[0] == "effects" and isinstance(path[1], int):
+        kind = machine.plant.effects[path[1]].kind
+        return {"viscous_friction": "viscous", "coulomb_friction": "dry"}.get(kind, f"{kind}.{path[-1]}")
+    return str(path[0])
+
+
+def _delay(machine: Machine) -> float:
+    law = machine.controller
+    return 0.0 if law is None or law.delay is None else float(np.max(np.asarray(law.delay)))
+
+
+def _nearest(delay: float) -> int:
+    return int(np.argmin(np.abs(_DELAYS - delay)))
+
+
+def _stiffness(machine: Machine) -> float:
+    """Return the stiffness of the servo at the guesses, seen at the joint."""
+    law = machine.controller
+    inner = np.max(np.asarray(law.kv)) if isinstance(law, CascadePD) else 1.0
+    kp = np.max(np.asarray(getattr(law, "kp")))  # noqa: B009 (a law of either class)
+    return float(np.abs(machine.gain[0]) * kp * inner)
+
+
+def _damping(machine: Machine) -> dict[str, float]:
+    """Return the damping of the servo and that of the joint at their guesses, seen at the joint."""
+    law = machine.controller
+    kd = getattr(law, "kv" if isinstance(law, CascadePD) else "kd")
+    own = [e for e in machine.plant.effects if e.kind == "viscous_friction"]
+    return {
+        "kd": float(np.abs(machine.gain[0]) * np.max(np.asarray(kd))),
+        "viscous": sum(float(np.asarray(e.coefficient)) for e in own),  # pyright: ignore[reportAttributeAccessIssue]
+    }
