@@ -88,7 +88,7 @@ def _tracing() -> bool:
 def _quick(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a function in least time; see `jaxid.numerics.lanes.quick_to_compile`."""
     options = {"compiler_options": quick_to_compile()}
-    return eqx.filter_jit(function, **options)  # pyright: ignore[reportCallIssue]  # those of `jax.jit`
+    return eqx.filter_jit(function, **options)  # pyright: ignore[reportCallIssue, reportArgumentType]  # those of `jax.jit`
 
 
 def _key(function: Callable, static: Any, arrays: list) -> bytes | None:
