@@ -97,9 +97,11 @@ def first_case_files(args: argparse.Namespace) -> list[str]:
 
 def found_robot_files(args: argparse.Namespace) -> list[str]:
     """Return the name of the MJCF with the result in it, if one is given in place of a case."""
+    if not is_robot(args.case) or args.case.endswith(".urdf"):
+        return []
     from jaxid.commands.robot_case import found_file
 
-    return [found_file(args.case)] if is_robot(args.case) and not args.case.endswith(".urdf") else []
+    return [found_file(args.case)]
 
 
 def logs_of(args: argparse.Namespace) -> str | list[str] | None:

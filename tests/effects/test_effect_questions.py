@@ -39,6 +39,8 @@ ADDING = {
     "discovery/at_rest/break_away.py": {"StaticFriction"},
     "simulation/step_size.py": {"ViscousFriction"},
     "estimators/minimal/read_back.py": {"ViscousFriction"},
+    "experiment_design/next_case.py": {"AddedMass"},
+    "experiment_design/unforced.py": {"AddedMass"},
 }
 
 

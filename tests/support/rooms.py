@@ -53,6 +53,8 @@ AGAINST = {
     ("studies", "commands"): "a study of `discover` runs it",
     ("comparison", "results"): "a result prints and saves itself",
     ("studies", "results"): "a result prints and saves itself",
+    ("experiment_design", "results"): "an experiment saves itself with the case that fits its log",
+    ("experiment_design", "commands"): "types only",
     ("results", "commands"): "types only",
     ("estimators", "steady"): "a steady table has a fit of its own",
     ("session", "steady"): "a steady table is opened in a way of its own",

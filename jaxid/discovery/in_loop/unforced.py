@@ -49,7 +49,7 @@ UNSEEN = "a log without a force is compared in the simulated loop, which follows
 _WINDOW = 0.02
 # `benchmarks.unforced`, 2026-11-26: 7 of 11 hidden effects named alone, nothing in 12 complete cases.
 _UNPROVEN = (
-    "without a force the effect that is named may stand for another one, as it did in 4 of 11 cases of the "
+    "without a force the effect that is named may stand for another one, as in 3 of 11 cases of the "
     "benchmark: hold what was found against another log (docs/without_a_force.md)"
 )
 

@@ -180,8 +180,9 @@ def _role(path: tuple[str | int, ...], machine: Machine) -> str:
         name = str(path[1])
         return "kd" if isinstance(machine.controller, CascadePD) and name == "kv" else name
     if path[0] == "effects" and isinstance(path[1], int):
-        kind = machine.plant.effects[path[1]].kind
-        return {"viscous_friction": "viscous", "coulomb_friction": "dry"}.get(kind, f"{kind}.{path[-1]}")
+        effect = machine.plant.effects[path[1]]
+        roles = {effect.viscous_coefficient: "viscous", effect.sliding_level: "dry"}
+        return roles.get(str(path[-1]), f"{effect.kind}.{path[-1]}")
     return str(path[0])
 
 
@@ -206,8 +207,8 @@ def _damping(machine: Machine) -> dict[str, float]:
     """Return the damping of the servo and that of the joint at their guesses, seen at the joint."""
     law = machine.controller
     kd = getattr(law, "kv" if isinstance(law, CascadePD) else "kd")
-    own = [e for e in machine.plant.effects if e.kind == "viscous_friction"]
+    own = [getattr(e, e.viscous_coefficient) for e in machine.plant.effects if e.viscous_coefficient]
     return {
         "kd": float(np.abs(machine.gain[0]) * np.max(np.asarray(kd))),
-        "viscous": sum(float(np.asarray(e.coefficient)) for e in own),  # pyright: ignore[reportAttributeAccessIssue]
+        "viscous": sum(float(np.asarray(value)) for value in own),
     }
