@@ -55,6 +55,7 @@ AGAINST = {
     ("studies", "results"): "a result prints and saves itself",
     ("experiment_design", "results"): "an experiment saves itself with the case that fits its log",
     ("experiment_design", "commands"): "types only",
+    ("export", "commands"): "types only",
     ("results", "commands"): "types only",
     ("estimators", "steady"): "a steady table has a fit of its own",
     ("session", "steady"): "a steady table is opened in a way of its own",
