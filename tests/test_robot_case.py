@@ -119,7 +119,8 @@ def test_servos_without_a_force_end_in_the_robots_file(folder, capsys):
     assert found.dof_frictionloss[0] == pytest.approx(0.3, rel=0.03)
     # The user's own file stays as it was.
     assert 'kp="3000"' in (folder / "robot.xml").read_text()
-    [line] = [line for line in ran.out.splitlines() if line.startswith("moves")]
+    # A row of the table: the log, then a pair for each joint.
+    [line] = [line for line in ran.out.splitlines() if line.split()[2:3] == ["->"]]
     before, after = (float(x) for x in line.split()[1:4:2])
     assert before > 10 * after
 
