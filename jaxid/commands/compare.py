@@ -16,13 +16,12 @@ from jaxid.comparison.result import Comparison, Difference, LogGap, Rival, Value
 from jaxid.comparison.rows import ComparedLog
 from jaxid.comparison.search import Named, Search
 from jaxid.consistency.absent import acts_by_position
-from jaxid.discovery.in_loop.unforced import largest_force, loop_machine, searched, with_command
+from jaxid.discovery.in_loop.unforced import loop_machine, loop_superset
 from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.errors import InputError
 from jaxid.estimators import need_alike, need_known_controller, need_known_reference, steps_of
 from jaxid.estimators.several.force import inverse_dynamics_steps
 from jaxid.estimators.several.parts import parts_of
-from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.logs.in_memory import LogLike
 from jaxid.machine import Machine
 from jaxid.model.unknowns import Free
@@ -110,10 +109,7 @@ def _search_in_loops(session: Session, groups: Sequence[Sequence[OpenedLog]]) ->
         InputError: If a loop cannot be simulated.
     """
     machine, base = loop_machine(run_alone(steps_of("output_error", session)))
-    data = with_command(session, machine)
-    first = session.fit.machine(machine)
-    between = largest_force(first, session.fit.log, choose_numerics(first, session.fit.log))
-    superset = build_candidate_model(machine, data, searched(session, machine), between)
+    superset, _ = loop_superset(session, machine)
     logs = tuple(LoopLog.of(runs, machine, superset) for runs in groups)
     held = () if base is None else (base,)
     return Search(superset, logs, _comparable(session, superset.base), held=held)

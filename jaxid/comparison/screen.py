@@ -67,7 +67,7 @@ class Screen:
 
     @property
     def apart_threshold(self) -> float:
-        """The same for a set of parameters for each log."""
+        """Threshold of the evidence of a set of parameters for each log."""
         return largest_threshold(self.apart_by_chance)
 
     def false_alarm(self, evidence: float) -> float:

@@ -153,7 +153,7 @@ class CandidateModel:
 
     @functools.cached_property
     def own_enter(self) -> Dependence | None:
-        """How the inertial forces depend on these; None if anything else does too, such as the ports."""
+        """Dependence of the inertial forces on these; None if the ports or anything else depend on them."""
         plant, free = without_effects(self.machine.plant), self.machine.parameters.free
         if not len(self.own):
             return Dependence.CONSTANT

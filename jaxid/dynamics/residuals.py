@@ -29,17 +29,24 @@ def _balance_of(plant: Plant, bare: BarePlant | None, *now: Any) -> Balance:
     return plant.balance(*now) if bare is None else balance(plant, *now, reaction=None, bare=bare)
 
 
+def has_bare_part(plant: Plant) -> bool:
+    """Check that a plant without its effects can be computed apart, and that this saves time.
+
+    It can if the balance is that of all plants, and saves time if the joints are coupled.
+    """
+    return plant.coupled and type(plant).balance is Plant.balance
+
+
 def bare_along(plant: Plant, q: Array, qd: Array, qdd: Array) -> BarePlant | None:
     """Compute what the plant without its effects does along a motion, (time, ...).
 
-    None if its joints are not coupled, or if it has a balance of its own: the whole balance is then computed
-    for all samples at once.
+    None without a bare part, see `has_bare_part`: the whole balance is then computed for all samples at once.
 
     Args:
         plant: The plant; its effects do not matter.
         q, qd, qdd: Motion, (time, n).
     """
-    if not plant.coupled or type(plant).balance is not Plant.balance:
+    if not has_bare_part(plant):
         return None
     # Along a batch the recursion over links runs through memory: it takes six times as long.
     return jax.lax.map(lambda now: BarePlant.of(plant, *now), (q, qd, qdd))
@@ -261,13 +268,17 @@ def residual_along(
     period: Array | float,
     start: Array | float = 0.0,
     bare: BarePlant | None = None,
-) -> Float[Array, "time n"]:
-    """Compute inverse dynamics minus declared force, over `drive_ratio` [N or N m, declared units].
+) -> tuple[Float[Array, "time n"], Float[Array, " n"]]:
+    """Compute inverse dynamics minus declared force [N or N m, declared units].
 
     Arguments are those of `balance_along`.
+
+    Returns:
+        The residual of the balance over the `drive_ratio`, (time, n); and that ratio, (n,).
     """
     residual, drive = balance_along(plant, q, qd, qdd, u, period, start, bare)
-    return residual / drive_ratio(plant, drive, u, q.shape[1])
+    ratio = drive_ratio(plant, drive, u, q.shape[1])
+    return residual / ratio, ratio
 
 
 def drive_ratio(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxid.effects.inertia import AddedMass
 from jaxid.first_case.section import toml
-from jaxid.results.found_case import case_text, text_of_case
+from jaxid.results.found_case import case_text, edited_or_whole, text_of_case
 
 if TYPE_CHECKING:
     from jaxid.experiment_design.unforced import UnforcedDesign
@@ -29,8 +29,6 @@ def next_case(design: UnforcedDesign, path: Path) -> str:
         design: The experiment.
         path: File of the reference.
     """
-    import tomlkit
-
     folder = path.parent
     # A scale that is not known leaves the guesses, which a fit of the present logs has improved otherwise.
     text = text_of_case(design.case, folder) if design.result is None else case_text(design.result, folder)
@@ -45,12 +43,7 @@ def next_case(design: UnforcedDesign, path: Path) -> str:
         for entry in entries:
             keys = "".join(f"{key} = {toml(value)}\n" for key, value in entry.items())
             edited += f"\n[[{name}]]\n{keys}"
-    try:
-        if tomllib.loads(edited) == wanted:
-            return edited
-    except tomllib.TOMLDecodeError:
-        pass
-    return tomlkit.dumps(wanted)
+    return edited_or_whole(edited, wanted)
 
 
 def _added(design: UnforcedDesign, path: Path, tables: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:

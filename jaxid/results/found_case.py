@@ -226,7 +226,13 @@ def case_text(result: FitResult, folder: Path) -> str:
     document = tomlkit.parse(text)
     _rename_in(document, rename)
     _put_guesses(document, case, findings)
-    edited = _appended(tomlkit.dumps(document), added)
+    return edited_or_whole(_appended(tomlkit.dumps(document), added), wanted)
+
+
+def edited_or_whole(edited: str, wanted: Mapping[str, Any]) -> str:
+    """Return an edited text with its comments if it holds the wanted tables, else these without."""
+    import tomlkit
+
     try:
         if tomllib.loads(edited) == wanted:
             return edited

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array, library
 from jaxid.dynamics.hidden_joints import complete_motion
-from jaxid.dynamics.residuals import balance_along, bare_along, drive_ratio
+from jaxid.dynamics.residuals import bare_along, has_bare_part, residual_along
 from jaxid.logs.prepare import Prepared
 from jaxid.model.balance import BarePlant
 from jaxid.model.drives import Drives
@@ -89,9 +89,8 @@ def _residual_and_ratio(
     delays = plant.command_delays(data.force.shape[1])
     u = signals.delayed(data.force, delays, data.period, hold=data.hold)
     motion = whole_motion(plant, data, u)
-    residual, drive = balance_along(plant, *motion, u, data.period, data.start, bare)
-    ratio = drive_ratio(plant, drive, u, data.q.shape[1])
-    return data.decimator(residual / ratio), ratio
+    residual, ratio = residual_along(plant, *motion, u, data.period, data.start, bare)
+    return data.decimator(residual), ratio
 
 
 def whole_motion(plant: Plant, data: ForceData, u: Array) -> tuple[Array, Array, Array]:
@@ -166,7 +165,7 @@ def _linearised(
 
 def knows_bare_plant(plant: Plant, data: ForceData) -> bool:
     """Check that a log determines what the plant does without its effects: the motion of all joints."""
-    return plant.coupled and all(data.measured) and type(plant).balance is Plant.balance
+    return has_bare_part(plant) and all(data.measured)
 
 
 @kept_jit

@@ -200,7 +200,7 @@ def test_regressor_times_parameters_is_the_force():
     plant, motion, period = simulated_motion()
 
     def residual(theta):
-        return residual_along(scatter(PLACES, plant, theta), *motion, period)[:, 0]
+        return residual_along(scatter(PLACES, plant, theta), *motion, period)[0][:, 0]
 
     e, regressor = jax.jit(lambda th: (residual(th), jax.jacfwd(residual)(th)))(TRUTH)
     u = np.asarray(motion[3])[:, 0]
@@ -215,7 +215,7 @@ def test_simulated_velocities_agree_with_the_balance():
     """The residual with accelerations differenced from the simulation vanishes to second order."""
     plant, (q, v, _, u), period = simulated_motion()
     a = jnp.gradient(v[:, 0], period)[:, None]
-    e = np.asarray(jax.jit(residual_along)(plant, q, v, a, u, period))[1:-1, 0]
+    e = np.asarray(jax.jit(residual_along)(plant, q, v, a, u, period)[0])[1:-1, 0]
     calm = np.abs(np.asarray(v)[1:-1, 0]) > 0.1  # away from the corner of the sign
     # h^2 / 6 times the third derivative of v: 1e-6 / 6 * (60 / s)^3 * 1 m/s * 2 kg = 0.07 N
     assert np.abs(e[calm]).max() < 0.07
@@ -235,7 +235,7 @@ def test_own_states_driven_along_a_motion_are_those_of_the_simulation():
         out = run(plant, period, jnp.asarray(u), start, hold="linear")
         a = jnp.gradient(out.velocity[:, 0], period)[:, None]
         motion = (out.position, out.velocity, a, jnp.asarray(u)[:, None])
-        e = jax.jit(residual_along)(plant, *motion, period)
+        e = jax.jit(residual_along)(plant, *motion, period)[0]
         errors.append(np.sqrt(np.mean(np.asarray(e)[2:-2, 0] ** 2)))
     # of a force of 40 N; second order, 4 a halving, less at the corners of the hysteresis
     assert errors[1] < 0.05
@@ -261,7 +261,7 @@ def test_what_sits_behind_a_spring_is_driven_along_the_motion_of_the_joint():
 
     def rms(*effects) -> float:
         plant = Axis(inertia, effects=(*friction, *effects), smoothing=Smoothing(1e-6))
-        e = jax.jit(residual_along)(plant, *map(jnp.asarray, (q, v, a, u)), 1 / axes.RATE)
+        e = jax.jit(residual_along)(plant, *map(jnp.asarray, (q, v, a, u)), 1 / axes.RATE)[0]
         return float(np.sqrt(np.mean(np.square(np.asarray(e)[moving]))))
 
     flexible, rigid = rms(EFFECTS["joint_flexibility"](**behind)), rms()

@@ -107,7 +107,7 @@ def test_residual_is_in_declared_units():
     """(m a - g u) / g: in units of the load, a gain of zero would be a perfect fit."""
     plant = plant_of((("actuator_gain", {"gain": 1.2}),))
     motion = [getattr(MOTION, name) for name in ("q", "qd", "qdd", "force")]
-    e = np.asarray(jax.jit(residual_along)(plant, *motion, MOTION.period))
+    e = np.asarray(jax.jit(residual_along)(plant, *motion, MOTION.period)[0])
     expected = MASS / 1.2 * np.asarray(MOTION.qdd) - np.asarray(MOTION.force)
     np.testing.assert_allclose(e, expected, atol=1e-10)  # rounding of a thousand N
 

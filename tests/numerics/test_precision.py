@@ -157,7 +157,7 @@ def axis_regressor() -> np.ndarray:
     places = tuple((path, None) for path in leaves)
 
     def residual(theta):
-        return residual_along(scatter(places, plant, theta), *motion, 0.01)[:, 0]
+        return residual_along(scatter(places, plant, theta), *motion, 0.01)[0][:, 0]
 
     return np.asarray(jax.jit(jax.jacfwd(residual))(jnp.asarray([2.0, 0.5, 1.0])))
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.discovery.candidates import View
+from jaxid.discovery.candidates import CandidateModel, View
 from jaxid.discovery.final import final_machine, machine_with
 from jaxid.discovery.in_loop.positions import JoinedLoops, Loops, LoopSamples, LoopSearch, PositionDomain
 from jaxid.discovery.result import Discovery, Round
@@ -134,10 +134,8 @@ def _search(session: Session, machine: Machine, progress: Callable[[str], None])
     """Return the search for the effects that a fitted machine lacks."""
     first = session.fit.machine(machine)
     log = session.fit.log
-    data = with_command(session, machine)
+    superset, data = loop_superset(session, machine)
     numerics = choose_numerics(first, log)
-    between = largest_force(first, log, numerics)
-    superset = build_candidate_model(machine, data, searched(session, machine), between)
     period = log.period if machine.controller is None else machine.controller.period
     floor = position_noise(first, log)
 
@@ -176,7 +174,18 @@ def _search(session: Session, machine: Machine, progress: Callable[[str], None])
     )
 
 
-def with_command(session: Session, machine: Machine) -> Prepared:
+def loop_superset(session: Session, machine: Machine) -> tuple[CandidateModel, Prepared]:
+    """Return a fitted machine with all effects that a search tries, and the first log with its command.
+
+    Raises:
+        InputError: If the loop cannot be simulated.
+    """
+    data, first, log = _with_command(session, machine), session.fit.machine(machine), session.fit.log
+    between = _largest_force(first, log, choose_numerics(first, log))
+    return build_candidate_model(machine, data, searched(session, machine), between), data
+
+
+def _with_command(session: Session, machine: Machine) -> Prepared:
     """Return the prepared log with the simulated force of the drives, which gives the scale of effects."""
     data = session.fit.data
     (gap,) = gaps(machine, (session.fit,))
@@ -189,7 +198,7 @@ def with_command(session: Session, machine: Machine) -> Prepared:
     return replace(data, force=gap.simulation.command * machine.gain, moving=np.ones_like(data.moving))
 
 
-def largest_force(machine: Machine, log: Log, numerics: Numerics) -> Float[np.ndarray, " m"]:
+def _largest_force(machine: Machine, log: Log, numerics: Numerics) -> Float[np.ndarray, " m"]:
     """Return the largest absolute force of each drive at all ticks of the simulated loop, (m,)."""
     replay = make_replay(machine, log, numerics)
     run = _run(replace(replay, every=1), machine.plant)
