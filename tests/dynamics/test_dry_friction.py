@@ -30,9 +30,15 @@ def true_position(effects) -> np.ndarray:
     ]
 
 
-def error(effects, substeps: int) -> float:
+class CoupledAxis(Axis):
+    """An axis whose balance is solved as that of an arm, whose steps are tried in a loop."""
+
+    coupled = True
+
+
+def error(effects, substeps: int, machine: type[Axis] = Axis) -> float:
     """Largest, over the largest position."""
-    plant = Axis(MASS, effects=tuple(EFFECTS[kind](**values) for kind, values in effects.items()))
+    plant = machine(MASS, effects=tuple(EFFECTS[kind](**values) for kind, values in effects.items()))
     drive = Drive(jnp.ones(1), 1 / RATE, substeps=substeps, set_valued=True)
     run = open_loop(plant, drive, jnp.asarray(COMMAND)[:, None], jnp.zeros(1), jnp.zeros(1))
     true = true_position(effects)
@@ -45,6 +51,11 @@ def error(effects, substeps: int) -> float:
 def test_motion_from_rest_is_the_exact_one(effects):
     assert error(effects, 1) < 2e-3
     assert error(effects, 8) < 3e-4
+
+
+@pytest.mark.parametrize("effects", [COULOMB, STRIBECK, BREAK_AWAY], ids=["coulomb", "stribeck", "static"])
+def test_a_coupled_machine_sticks_and_slides_as_exactly(effects):
+    assert error(effects, 1, CoupledAxis) == pytest.approx(error(effects, 1), rel=1e-6)
 
 
 def test_friction_that_falls_with_speed_is_taken_halfway():
