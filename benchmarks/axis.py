@@ -15,7 +15,7 @@ import numpy as np
 from jaxid.controllers import CascadePD
 from jaxid.effects import EFFECTS
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform
-from jaxid.estimators.output_error import _fit
+from jaxid.estimators.output_fit import fit_alone
 from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import scatter
 from jaxid.plants import Axis
@@ -147,7 +147,7 @@ def fit(run: Replay, base: Axis, theta: np.ndarray, measured: np.ndarray) -> Min
     """Fit the position by jaxid's output-error method from some start, (4,)."""
     measured = jnp.asarray(measured)[:, None]
     weight, active = jnp.ones(measured.shape), np.ones(len(PLACES), bool)
-    minimum = _fit(
+    minimum = fit_alone(
         run,
         PLACES,
         base,

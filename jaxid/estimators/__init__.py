@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from jaxid.case.case import Case
     from jaxid.estimators.common.minimisers import Minimiser
     from jaxid.estimators.several.parts import Part
+    from jaxid.machine import Machine
     from jaxid.session import Session
     from jaxid.simulation.replay import Numerics
 
@@ -76,6 +77,7 @@ def _output_error(
 
     from jaxid.estimators.output_error import output_error_steps
     from jaxid.estimators.several.parts import parts_of
+    from jaxid.simulation.sensor_noise import force_noise
 
     solver, minimiser = solver or stated.solver, minimiser or stated.minimiser
     demands = case.identification
@@ -84,7 +86,7 @@ def _output_error(
         "profile": demands.profile if profile is None else profile,
     }
     need_no_profile(session, precision["profile"])
-    options = {"numerics": numerics, "on": on, "minimiser": minimiser, **precision}
+    options: dict[str, Any] = {"numerics": numerics, "on": on, "minimiser": minimiser, **precision}
     if session.machine.unforced(log):
         from jaxid.estimators.unforced import unforced_steps
 
@@ -92,8 +94,9 @@ def _output_error(
     start = yield from _start(session)
     options["solver"] = solver
     logs = parts_of(session) if session.more else log
+    options["command_noise"] = [force_noise(session.machine, run.data) for run in session.fits]
     result = yield from output_error_steps(session.machine, logs, start=start, **options)
-    result = replace(result, notes=(*result.notes, *_doubts_of_output_error(session)))
+    result = replace(result, notes=(*result.notes, *_doubts_of_output_error(session.machine)))
     if all(log.measured) and not session.more:
         from jaxid.estimators.faster_loop import with_loop_of_log
 
@@ -105,26 +108,14 @@ def _output_error(
     return min((result, other), key=lambda e: (not e.converged, np.nansum(e.residual**2)))
 
 
-def _doubts_of_output_error(session: Session) -> list[str]:
+def _doubts_of_output_error(machine: Machine) -> list[str]:
     """Return why the standard deviations of output error may be too small on a log, a sentence each."""
-    from jaxid.simulation.sensor_noise import force_noise
-
-    machine, log = session.machine, session.fit.log
-    if machine.controller is None:
-        if any(type(e).opens_spring for e in machine.plant.effects):
-            return [
-                "an open-loop simulation hangs on every impact in a clearance: the fit may end at a local "
-                "optimum, many standard deviations off"
-            ]
-        noise = force_noise(machine, session.fit.data)
-        if np.any(noise > 1e-3 * np.std(log.force, axis=0)):
-            return [
-                "an open-loop simulation takes the logged force as exact, but it holds noise of about "
-                f"{', '.join(f'{x:.2g}' for x in noise)}: the standard deviations are too small, use "
-                "prediction_error"
-            ]
-        return []
-    if machine.sensor.mean.position_resolution is not None:
+    if machine.controller is None and any(type(e).opens_spring for e in machine.plant.effects):
+        return [
+            "an open-loop simulation hangs on every impact in a clearance: the fit may end at a local "
+            "optimum, many standard deviations off"
+        ]
+    if machine.controller is not None and machine.sensor.mean.position_resolution is not None:
         return [
             "the loop is simulated with an encoder that rounds, which makes the cost rough: the fit may end "
             "several standard deviations off, use prediction_error"

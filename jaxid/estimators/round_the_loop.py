@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.estimators.common.scores import Scores
 from jaxid.estimators.simulated_output import output_residual
 from jaxid.model.plant import Plant
 from jaxid.numerics.kept import kept_jit
@@ -23,8 +24,6 @@ from jaxid.simulation.replay import Replay
 
 # Pairs of simulated noise.
 _PAIRS = 16
-# Eigenvalue of the scaled normal matrix, relative to the largest, below which a direction is not corrected.
-_BLIND = 1e-10
 
 
 @dataclass(frozen=True)
@@ -71,17 +70,12 @@ def shift_steps(logs: Sequence[tuple[tuple, Float[np.ndarray, " n"], Rows]], on:
     Source:
         Cook & Stefanski (1994), JASA 89, simulation-extrapolation.
     """
-    rng, q = np.random.default_rng(0), logs[0][2].jacobian.shape[-1]
-    normal, scores = np.zeros((q, q)), np.zeros((_PAIRS, q))
+    rng, scores = np.random.default_rng(0), Scores.none(logs[0][2], _PAIRS)
     for (replay, *others), std, rows in logs:
         loud = replace(replay, sensor=replace(replay.sensor, position_noise=np.asarray(std)))
         ticks = len(replay.disturbance)
         noise = rng.standard_normal((_PAIRS, ticks, len(std)))
         changes = np.asarray((yield SolveRequest(_changes, (loud, *others, on, noise))))
-        flat = np.where(rows.counts[..., None], rows.jacobian, 0.0).reshape(-1, q)
-        normal += rows.weight * flat.T @ flat
-        scores += rows.weight * changes.reshape(_PAIRS, -1) @ flat
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = np.linalg.pinv(normal / np.outer(size, size), rcond=_BLIND, hermitian=True)
-    steps = -(scores / size) @ inverse / size
+        scores = scores.with_log(rows, changes)
+    steps = scores.steps()
     return Shift(steps.mean(axis=0), np.atleast_2d(np.cov(steps.T)) / _PAIRS)

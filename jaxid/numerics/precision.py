@@ -304,6 +304,23 @@ class Precision:
             equivalent_variance=None if self.equivalent_variance is None else self.equivalent_variance[:p],
         )
 
+    def with_at_least(self, covariance: Float[np.ndarray, "p p"]) -> Precision:
+        """Return the precision with another covariance, or a larger multiple where this one's std is larger.
+
+        Args:
+            covariance: Covariance of all parameters, (p, p); that of a parameter that is not identifiable is
+                not taken over.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = self.std / np.sqrt(np.diag(covariance))
+        factor = np.where(np.isfinite(factor), np.maximum(factor, 1.0), 1.0)
+        both = np.outer(self.identifiable, self.identifiable)
+        whole = np.where(both, covariance * np.outer(factor, factor), self.covariance)
+        white = self.equivalent_variance
+        if white is not None:
+            white = white * np.where(self.identifiable, np.diag(whole) / np.diag(self.covariance), 1.0)
+        return replace(self, covariance=whole, equivalent_variance=white)
+
     def beside(self, std: float) -> Precision:
         """Return the precision with one more parameter, whose standard deviation is known independently."""
         p = len(self.covariance)

@@ -39,6 +39,8 @@ _LONGER = 2.0
 _FIRST, _FAR_MORE = 100, 5.0
 # Part of the typical speed from which a log begins in motion.
 _MOVING = 0.2
+# A joint stands still if its first so many readings are within so many times their noise of the first one.
+_STANDS, _APART = 5, 5.0
 # Factor by which a band-limited command is upsampled before its samples are joined by lines.
 _REFINE = 8
 
@@ -308,6 +310,13 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
     return eqx.tree_at(lambda r: (r.position, r.velocity), replay, moved)
 
 
+def stands_still(log: Log) -> bool:
+    """Check that no joint with an encoder moves in the first samples of a log."""
+    readings = log.readings[:, list(log.measured)]
+    away = np.abs(readings[:_STANDS] - readings[0])
+    return bool(not log.integrated and np.all(away <= _APART * signals.high_band_std(readings)))
+
+
 @kept_jit
 def _start(
     replay: Replay, plant: Plant, readings: Array, measured: tuple[bool, ...], of_velocity: bool
@@ -353,6 +362,23 @@ def _open(
         every,
         follow,
     )
+
+
+def noise_of_command(
+    replay: Replay, std: Float[np.ndarray, " m"], rng: np.random.Generator, runs: int
+) -> Float[np.ndarray, "runs ticks m"]:
+    """Draw noise of the logged command of an open loop, at the ticks of its simulation.
+
+    Args:
+        replay: Run in open loop.
+        std: Standard deviation of a logged command, (m,).
+        rng: Source of the random numbers.
+        runs: Number of draws.
+    """
+    assert replay.command is not None, "make_replay gives an open loop its command"
+    samples = (len(replay.command) - 1) // replay.every + 1
+    noise = std * rng.standard_normal((runs, samples, len(std)))
+    return noise if replay.every == 1 else np.stack([_refined(one) for one in noise])
 
 
 def _refined(command: np.ndarray) -> np.ndarray:
