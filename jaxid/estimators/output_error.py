@@ -57,8 +57,8 @@ from jaxid.simulation.sensor_noise import position_noise
 
 # A freed start of a loop is kept if it lowers the cost by this many times what chance does.
 _CLEARLY = 10.0
-# A standard deviation that grows by no more than this factor is no news.
-_SLIGHTLY = 1.1
+# Noise is no news that moves no estimate by this many standard deviations, nor widens one by this factor.
+_LITTLE, _SLIGHTLY = 0.1, 1.1
 
 
 def output_error(
@@ -315,19 +315,16 @@ def _without_noise(
 ) -> Steps[tuple[np.ndarray, Precision, list[str]]]:
     """Remove the bias by noise that goes round the loop, and return estimates, precision and notes.
 
-    It is a small part of the deviations of a log alone. Beside another log, in which something is known to
-    differ, it is several of them in the directions that the difference separates.
+    The bias is a small part of the deviations of a log alone. Beside another log, in which something is known
+    to differ, it is several of them in the directions that the difference separates. Noise that dithers dry
+    friction scatters the estimates by more than follows from the colour of the residual.
 
     Args:
         fit, end: The fit and its end.
         moving: Residual of each log, with the columns of the unknowns that move.
         precision: Precision of the unknowns.
     """
-    # No more than the readings show, whatever the case states.
-    noise = [
-        np.minimum(position_noise(o.part.machine, o.part.log), signals.high_band_std(o.part.log.readings))
-        for o in fit.outputs
-    ]
+    noise = [_noise_of(output, log) for output, log in zip(fit.outputs, end.logs, strict=True)]
     if fit.unforced and not fit.noise_limited(end.logs):
         # Errors of the model move the estimates more, and hide how the noise does.
         return end.theta, precision, []
@@ -341,13 +338,29 @@ def _without_noise(
         return end.theta, precision, []
     step = np.where(seen, shift.step[:p], 0.0)
     theta = np.clip(end.theta + step, *fit.machine.parameters.bounds)
-    most = float(np.max(np.abs(step[seen]) / precision.std[seen]))
+    whole = replace(precision, covariance=precision.covariance + shift.covariance[:p, :p])
+    whole = whole.with_at_least(shift.scatter[:p, :p])
+    most = float(np.max(np.abs(step[seen]) / whole.std[seen]))
+    wider = float(np.max(whole.std[seen] / precision.std[seen]))
+    if most < _LITTLE and wider < _SLIGHTLY:
+        return theta, whole, []
     note = (
-        "the noise of the readings goes round the loop: its effect on the estimates, at most "
-        f"{most:.2g} standard deviations, was simulated and removed"
+        "the noise of the readings goes round the loop: its effect on the estimates was simulated; a bias "
+        f"of at most {most:.2g} standard deviations was taken off, and these are up to {wider:.2g} times as "
+        "large"
     )
-    precision = replace(precision, covariance=precision.covariance + shift.covariance[:p, :p])
-    return theta, precision, [note]
+    return theta, whole, [note]
+
+
+def _noise_of(output: Output, rows: Rows) -> np.ndarray:
+    """Return the standard deviation of a log's readings: no more than readings and residual show, (n,)."""
+    part, n = output.part, output.part.log.position.shape[1]
+    noise = np.minimum(position_noise(part.machine, part.log), signals.high_band_std(part.log.readings))
+    if rows.residual.shape[1] != n:
+        return noise
+    # In a slow log motion reaches the highest frequencies, and counts as noise there.
+    counts = np.maximum(rows.counts.sum(axis=0), 1)
+    return np.minimum(noise, np.sqrt(np.sum(np.where(rows.counts, rows.residual, 0.0) ** 2, axis=0) / counts))
 
 
 def _pushed(
@@ -374,7 +387,7 @@ def _pushed(
         # A restart adds the noise of its state, of which the size is not known.
         return end.theta, precision, [f"{exact}: the standard deviations are too small, use prediction_error"]
     arguments = [o.arguments(end.theta, end.starts[p]) for o, p in zip(fit.outputs, fit.places, strict=True)]
-    readings = [position_noise(o.part.machine, o.part.log) for o in fit.outputs]
+    readings = [_noise_of(output, log) for output, log in zip(fit.outputs, end.logs, strict=True)]
     logs = list(zip(arguments, noise, readings, moving, strict=True))
     pushed = yield from pushed_steps(logs, fit.on)
     p, seen = fit.unknowns, precision.identifiable

@@ -23,20 +23,22 @@ from jaxid.numerics.precision import Rows
 from jaxid.simulation.replay import Replay
 
 # Pairs of simulated noise.
-_PAIRS = 16
+_PAIRS = 32
 
 
 @dataclass(frozen=True)
 class Shift:
-    """Change of the estimates that removes a bias.
+    """Change of the estimates that removes a bias, and their scatter.
 
     Args:
         step: Mean change, (q,).
         covariance: Its covariance, because the simulated noise is finite, (q, q).
+        scatter: Covariance of the estimates by the noise of the readings, which goes round the loop, (q, q).
     """
 
     step: Float[np.ndarray, " q"]
     covariance: Float[np.ndarray, "q q"]
+    scatter: Float[np.ndarray, "q q"]
 
 
 @kept_jit
@@ -49,14 +51,21 @@ def _changes(
     theta: Array,
     on: str,
     noise: Array,
-) -> Float[Array, "pairs time k"]:
-    """Return the mean change of the residual by each pair of opposite noise, (pairs, ticks, n)."""
+) -> tuple[Float[Array, "pairs time k"], Float[Array, "pairs time k"]]:
+    """Return the even and the odd change of the residual by each pair of opposite noise."""
     residual = lambda noise: output_residual(replay, places, plant, measured, weight, on, noise)(theta)
     quiet = output_residual(replay, places, plant, measured, weight, on)(theta)
-    return jax.lax.map(lambda noise: 0.5 * (residual(noise) + residual(-noise)) - quiet, noise)
+
+    def both(noise: Array) -> tuple[Array, Array]:
+        plus, minus = residual(noise), residual(-noise)
+        return 0.5 * (plus + minus) - quiet, 0.5 * (plus - minus)
+
+    return jax.lax.map(both, noise)
 
 
-def shift_steps(logs: Sequence[tuple[tuple, Float[np.ndarray, " n"], Rows]], on: str) -> Steps[Shift]:
+def shift_steps(
+    logs: Sequence[tuple[tuple, Float[np.ndarray, " n"], Rows]], on: str, pairs: int = _PAIRS
+) -> Steps[Shift]:
     """Compute the change of the estimates that removes the bias, by one step of Gauss-Newton.
 
     The mean change of the residual by simulated noise is what a fit without noise leaves over. Pairs of
@@ -66,16 +75,25 @@ def shift_steps(logs: Sequence[tuple[tuple, Float[np.ndarray, " n"], Rows]], on:
         logs: For each log the arguments of its residual as of `output_residual`, with the values of its
             unknowns in place of `on`; the standard deviation of its readings; and its residual at the fit.
         on: Kind of the outputs.
+        pairs: Number of pairs of opposite noise.
 
     Source:
         Cook & Stefanski (1994), JASA 89, simulation-extrapolation.
     """
-    rng, scores = np.random.default_rng(0), Scores.none(logs[0][2], _PAIRS)
+    rng, none = np.random.default_rng(0), Scores.none(logs[0][2], pairs)
+    even, odd = none, none
     for (replay, *others), std, rows in logs:
         loud = replace(replay, sensor=replace(replay.sensor, position_noise=np.asarray(std)))
         ticks = len(replay.disturbance)
-        noise = rng.standard_normal((_PAIRS, ticks, len(std)))
-        changes = np.asarray((yield SolveRequest(_changes, (loud, *others, on, noise))))
-        scores = scores.with_log(rows, changes)
-    steps = scores.steps()
-    return Shift(steps.mean(axis=0), np.atleast_2d(np.cov(steps.T)) / _PAIRS)
+        noise = rng.standard_normal((pairs, ticks, len(std)))
+        bent, shaken = yield SolveRequest(_changes, (loud, *others, on, noise))
+        even = even.with_log(rows, np.asarray(bent))
+        # A measured position holds its noise beside the motion that the noise has caused, and with a reversed
+        # sign in the residual. A command is computed from the noisy reading, in the simulation too.
+        beside = np.zeros_like(shaken)
+        if on in ("position", "both"):
+            beside[..., : len(std)] = std * noise[:, :: replay.every]
+        odd = odd.with_log(rows, np.asarray(others[3]) * beside - np.asarray(shaken))
+    steps, scatter = even.steps(), odd.steps()
+    covariance = np.atleast_2d(np.cov(steps.T)) / pairs
+    return Shift(steps.mean(axis=0), covariance, scatter.T @ scatter / pairs)
