@@ -36,8 +36,8 @@ HERE = Path(__file__).parent / "results"
 ROOT = Path(__file__).parents[1]
 # First rows of each fitted motion, 40 s: the three together are 0.23 s of rollout.
 ROWS = 2001
-# Ranges of the search. Where a third entry says so, it runs over the logarithm. PACE's own ranges are part of a
-# robot's settings; the ranges here are wide enough that no joint ends at one of them for want of room.
+# Ranges of the search, which runs over the logarithm where a third entry says so. PACE's own ranges are part of
+# a robot's settings; these are wide.
 RANGES = {
     "armature": (1e-4, 1.0, "log"),
     "damping": (1e-2, 300.0, "log"),
@@ -123,9 +123,9 @@ def in_range(name: str, share: np.ndarray) -> np.ndarray:
 def evolve(base: mujoco.MjModel, courses: Sequence[Course], names: Sequence[str]) -> dict[str, np.ndarray]:
     """Fit the parameters of all joints, and return the mean of the last generation.
 
-    Every joint has a strategy of its own, and one rollout carries a candidate of each: with five or seven unknowns
-    a strategy converges within a budget that is hardly a start for one in six times as many. The joints move
-    each other little, so that the error of a joint is its own candidate's.
+    Every joint has a strategy of its own, and one rollout carries a candidate of each: with five or seven
+    unknowns a strategy converges within a budget that is hardly a start for one with six times as many. The
+    joints move each other little, so that the error of a joint is its own candidate's.
     """
     options = {"bounds": [0.0, 1.0], "popsize": POPULATION, "seed": SEED, "verbose": -9, "maxiter": 10**6}
     searches = [
@@ -208,7 +208,7 @@ def replayed(model: mujoco.MjModel, motion: np.ndarray) -> np.ndarray:
 
 
 def shown(logs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the motions that are scored: the fitted rows of three, and six whole ones that no fit has seen."""
+    """Return the motions that are scored: the fitted rows of three, and six whole ones left out of all fits."""
     return {**{name: logs[name][:ROWS] for name in FITTED}, **{name: logs[name] for name in LEFT_OUT}}
 
 
@@ -234,12 +234,12 @@ def table(content: dict[str, Any]) -> str:
         "# SO-101 by an evolution strategy, and by jaxid",
         "",
         f"Written by `python -m benchmarks.so101_cmaes` on {content['date']}, at {content['commit']}.",
-        "Figures are RMS of simulated minus measured position in mrad, the mean over six motions that no fit has seen:",
-        f"{', '.join(LEFT_OUT)}.",
+        "Figures are RMS of simulated minus measured position in mrad, the mean over six motions left out of all",
+        f"fits: {', '.join(LEFT_OUT)}.",
         f"Fitted: the first {ROWS} rows of {', '.join(FITTED)}, by all.",
-        f"CMA-ES (`cma`, population {POPULATION}) has {EVALUATIONS} evaluations of these, in one thread; each joint",
-        "has a strategy of its own, and one rollout of MuJoCo carries a candidate of each. jaxid's time is that of",
-        "the whole command in a fresh process, with its simulations of nine motions and MuJoCo's replays.",
+        f"CMA-ES (`cma`, population {POPULATION}) has {EVALUATIONS} evaluations of these, in one thread; each",
+        "joint has a strategy of its own, and one rollout of MuJoCo carries a candidate of each. jaxid's time is",
+        "that of the whole command in a fresh process, with its simulations of nine motions and MuJoCo's replays.",
         "",
         f"| joint | {' | '.join(words[name] for name in runs)} |",
         "|---" * (1 + len(runs)) + "|",
@@ -260,9 +260,8 @@ def table(content: dict[str, Any]) -> str:
             continue
         values = runs[fit]["values"]
         lines += ["", f"Values of {words[fit]} (no standard deviation comes with them):", ""]
-        lines += [
-            f"| joint | {' | '.join(f'{n} [{u}]' for n, u in zip(RANGES, UNITS, strict=True) if n in values)} |"
-        ]
+        heads = [f"{name} [{unit}]" for name, unit in zip(RANGES, UNITS, strict=True) if name in values]
+        lines.append(f"| joint | {' | '.join(heads)} |")
         lines.append("|---" * (1 + len(values)) + "|")
         for k, joint in enumerate(JOINTS):
             lines.append(f"| {joint} | {' | '.join(f'{v[k]:.3g}' for v in values.values())} |")
