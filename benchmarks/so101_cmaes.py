@@ -36,8 +36,8 @@ HERE = Path(__file__).parent / "results"
 ROOT = Path(__file__).parents[1]
 # First rows of each fitted motion, 40 s: the three together are 0.23 s of rollout.
 ROWS = 2001
-# Ranges of the search, which runs over the logarithm where a third entry says so. PACE's own ranges are part of
-# a robot's settings; these are wide.
+# Ranges of the search, which runs over the logarithm where a third entry says so. PACE's own ranges are part
+# of a robot's settings; these are wide.
 RANGES = {
     "armature": (1e-4, 1.0, "log"),
     "damping": (1e-2, 300.0, "log"),
@@ -185,13 +185,13 @@ def by_jaxid(data: Path) -> dict[str, Any]:
         result = json.loads((out / "result.json").read_text())
         model = mujoco.MjModel.from_xml_path(str(out / "so101_found.xml"))
     model.opt.timestep = STEP
-    own = result["gap"]["simulation"]["validations"]
+    own = result["gap"]["validations"]
     return {
         "seconds": seconds,
         "processor": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
         "converged": result["converged"],
         "rms": as_lists({name: replayed(model, motion) for name, motion in shown(logs).items()}),
-        "own": {name: [1e3 * x for x in own[name]] for name in LEFT_OUT},
+        "own": as_lists({name: 1e3 * np.array(own[name]["simulation"]) for name in LEFT_OUT}),
     }
 
 
@@ -208,7 +208,7 @@ def replayed(model: mujoco.MjModel, motion: np.ndarray) -> np.ndarray:
 
 
 def shown(logs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the motions that are scored: the fitted rows of three, and six whole ones left out of all fits."""
+    """Return the motions that are scored: the fitted rows of three, and six whole ones left out."""
     return {**{name: logs[name][:ROWS] for name in FITTED}, **{name: logs[name] for name in LEFT_OUT}}
 
 
@@ -234,12 +234,13 @@ def table(content: dict[str, Any]) -> str:
         "# SO-101 by an evolution strategy, and by jaxid",
         "",
         f"Written by `python -m benchmarks.so101_cmaes` on {content['date']}, at {content['commit']}.",
-        "Figures are RMS of simulated minus measured position in mrad, the mean over six motions left out of all",
-        f"fits: {', '.join(LEFT_OUT)}.",
+        "Figures are RMS of simulated minus measured position in mrad, the mean over six motions left out:",
+        f"{', '.join(LEFT_OUT)}.",
         f"Fitted: the first {ROWS} rows of {', '.join(FITTED)}, by all.",
-        f"CMA-ES (`cma`, population {POPULATION}) has {EVALUATIONS} evaluations of these, in one thread; each",
-        "joint has a strategy of its own, and one rollout of MuJoCo carries a candidate of each. jaxid's time is",
-        "that of the whole command in a fresh process, with its simulations of nine motions and MuJoCo's replays.",
+        f"CMA-ES (`cma`, population {POPULATION}) has {EVALUATIONS} evaluations of these, in one thread;",
+        "each joint has a strategy of its own, and one rollout of MuJoCo carries a candidate of each. jaxid's time",
+        "is that of the whole command in a fresh process, with its simulations of nine motions and MuJoCo's",
+        "replays of them.",
         "",
         f"| joint | {' | '.join(words[name] for name in runs)} |",
         "|---" * (1 + len(runs)) + "|",
