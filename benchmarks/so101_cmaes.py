@@ -238,7 +238,7 @@ def table(content: dict[str, Any]) -> str:
         f"{', '.join(LEFT_OUT)}.",
         f"Fitted: the first {ROWS} rows of {', '.join(FITTED)}, by all.",
         f"CMA-ES (`cma`, population {POPULATION}) has {EVALUATIONS} evaluations of these, in one thread;",
-        "each joint has a strategy of its own, and one rollout of MuJoCo carries a candidate of each. jaxid's time",
+        "each joint has its own strategy, and one rollout of MuJoCo carries a candidate of each. jaxid's time",
         "is that of the whole command in a fresh process, with its simulations of nine motions and MuJoCo's",
         "replays of them.",
         "",
