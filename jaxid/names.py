@@ -109,6 +109,7 @@ OPTIONAL_COLUMNS = (
     "load_position",
     "load_acceleration",
     "temperature",
+    "effort",
 )
 # Columns that only a table of steady speeds has.
 STEADY_COLUMNS = ("scatter", "samples")

@@ -188,6 +188,18 @@ class LogTable:
     temperature: str | tuple[str, ...] | None = key(
         columns(), f"{_COLUMN} of a temperature; no method uses it"
     )
+    effort: str | tuple[str, ...] | None = key(
+        columns("drive"), f"{_COLUMN} of a current or load, one a drive, compared with the force after a fit"
+    )
+    effort_gain: ByJoint | None = key(
+        by_drive(number("nonzero")),
+        "effort over the force of the drive, where it is known",
+        unit="unit of the effort per N or N m",
+        note="compared only",
+    )
+    effort_unsigned: bool | None = key(
+        flag, "whether the effort is a magnitude", note="true if no reading is below zero"
+    )
     kind: str = key(
         choice(LOG_KINDS),
         "a log over time, or steady: a table of steady velocities and the forces that hold them",

@@ -17,6 +17,7 @@ from jaxid.estimators import refuse_without_likelihood, steps_of
 from jaxid.estimators.choice import choose_method, with_choice
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
 from jaxid.estimators.common.profile import need_names
+from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.loop_noise import with_loop_noise
 from jaxid.gap import Gap, gaps, noise_floor
@@ -132,10 +133,11 @@ def identify(
     if choice is not None:
         estimate = with_choice(estimate, choice)
     progress("simulating")
+    left = gaps(estimate.machine, session.runs)
     return Identification(
         session,
-        estimate,
-        gaps(estimate.machine, session.runs),
+        with_effort(estimate, session, left),
+        left,
         noise_floor(estimate.machine, session.fit.log, session.fit.data),
     )
 

@@ -19,6 +19,7 @@ from jaxid.controllers.linear import PD, PID, CascadePD
 from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.apart.steps import apart_steps
 from jaxid.estimators.coarse_starts import coarse_starts
+from jaxid.estimators.effort import SCALE, Scale, scale_by_effort
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import Part, parts_of
@@ -72,7 +73,12 @@ def unforced_steps(session: Session, *, numerics: Numerics | None = None, **opti
     if len(parts) == 1 and result.converged:
         noisy = yield from fitted_with_noise(fitted, parts[0].log, result.theta, numerics=numerics, **options)
         result = noisy or result
-    return result if base is None else with_free_scale(result, machine, group, base)
+    if base is None:
+        return result
+    scale = scale_by_effort(session, parts, result)
+    if scale is not None:
+        return with_known_scale(result, machine, group, base, scale)
+    return with_free_scale(result, machine, group, base)
 
 
 def _cost(estimate: Estimate) -> float:
@@ -203,6 +209,58 @@ def with_free_scale(estimate: Estimate, machine: Machine, group: tuple[int, ...]
         std_misspecified=beside,
         notes=(*estimate.notes, note),
         details={**estimate.details, "relative": {"to": free[base].name, "values": relative}},
+    )
+
+
+def with_known_scale(
+    estimate: Estimate, machine: Machine, group: tuple[int, ...], base: int, scale: Scale
+) -> Estimate:
+    """Return an estimate that was made with one unknown held, as one whose scale an effort gives.
+
+    Args:
+        estimate: Estimate with the base held.
+        machine: The machine with all its unknowns.
+        group: Unknowns that are multiplied by the factor.
+        base: The one that was held.
+        scale: The factor; its derivatives are by the unknowns of the estimate.
+    """
+    free = machine.parameters.free
+    held = np.insert(estimate.theta, base, free[base].guess)
+    scaled = np.isin(np.arange(held.size), group)
+    theta = np.where(scaled, scale.factor * held, held)
+
+    # Each value of the group is the factor times that of the fit, and the factor depends on the fit.
+    others = np.delete(np.arange(held.size), base)
+    by_fit = np.diag(np.where(scaled, scale.factor, 1.0))[:, others]
+    by_fit += np.where(scaled, held, 0.0)[:, None] * scale.slopes
+    known = estimate.identifiable
+    by_fit, own = by_fit[:, known], estimate.precision.covariance[np.ix_(known, known)]
+    by_factor = np.where(scaled, held, 0.0)
+    covariance = by_fit @ own @ by_fit.T + scale.std**2 * np.outer(by_factor, by_factor)
+    identifiable = np.insert(known, base, True)
+    covariance[~identifiable], covariance[:, ~identifiable] = np.nan, np.nan
+
+    beside = estimate.std_misspecified
+    if beside is not None:
+        beside = np.insert(beside, base, 0.0)
+        beside = np.where(scaled, np.hypot(scale.factor * beside, scale.std * held), beside)
+    white = estimate.precision.equivalent_variance
+    precision = Precision(
+        covariance,
+        identifiable,
+        estimate.precision.unidentifiable,
+        np.append(estimate.precision.information, 1.0),
+        estimate.precision.kind,
+        estimate.precision.curvature,
+        None if white is None else np.insert(white, base, np.nan),
+    )
+    return replace(
+        estimate,
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        precision=precision,
+        std_misspecified=beside,
+        details={**estimate.details, SCALE: {"from": "effort", "relative_std": scale.std / scale.factor}},
     )
 
 

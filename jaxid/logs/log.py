@@ -70,6 +70,7 @@ class Log:
         load_position: Position behind a flexible coupling [m or rad].
         load_acceleration: Acceleration behind a flexible coupling [m/s^2 or rad/s^2].
         temperature: Temperature, in the unit of the file.
+        effort: Current or load of each drive, in the unit of the file.
         hold: Shape of the command between samples, one of `HOLDS`.
         rows: Rows of the file, 0-based and half open; (0, 0) means all.
         source: Origin of the log, for messages.
@@ -89,6 +90,7 @@ class Log:
     load_position: Column | None = None
     load_acceleration: Column | None = None
     temperature: Column | None = None
+    effort: Column | None = None
     hold: str = "zero_order"
     rows: tuple[int, int] = (0, 0)
     source: str = "log"
@@ -564,7 +566,7 @@ def _check_widths(
         width, needed, what = values.shape[1], expected, "joint"
         if key == "time":
             needed = 1
-        elif key in ("force", "reference"):
+        elif key in ("force", "reference", "effort"):
             needed, what = drive_count, "joint" if drive_count == expected else "drive"
             if drives is None:
                 needed = min(needed, width)

@@ -47,8 +47,8 @@ reference = "r"
 FREE = CASE.replace("kp = 2.0", "kp = { guess = 0.5 }")
 
 
-def log(seed: int = 0, **more: dict) -> dict[str, np.ndarray]:
-    """A servo of 4096 counts, without its force."""
+def log(seed: int = 0, *, force: bool = False, **more: dict) -> dict[str, np.ndarray]:
+    """A servo of 4096 counts, without its force unless that is asked for."""
     asked = moves(TIME, [0.0, 0.6, -0.4, 0.9], [2.0, 4.0, 1.0, 3.0], 40.0, rest=0.2)
     asked += multisine(TIME, [0.7, 1.9, 3.1], 0.15, seed)
     ticks = round(DELAY * RATE)
@@ -57,7 +57,8 @@ def log(seed: int = 0, **more: dict) -> dict[str, np.ndarray]:
     sensor = Sensor(position_resolution=2 * np.pi / 4096, position_noise=2e-4)
     machine = Machine(inertia=2e-3, effects={**FRICTION, **more})
     run = Setup(machine, loop, sensor, RATE, SECONDS, seed).run()
-    return {"t": run["t"], "q": run["position"], "r": asked}
+    columns = {"t": run["t"], "q": run["position"], "r": asked}
+    return columns | {"u": run["force"]} if force else columns
 
 
 def identify(case: str, log: dict[str, np.ndarray]) -> jaxid.Identification:
