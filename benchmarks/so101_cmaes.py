@@ -228,12 +228,13 @@ def table(content: dict[str, Any]) -> str:
     }
     runs = {name: content["runs"][name] for name in words if name in content["runs"]}
     if "jaxid" in runs:
-        runs["own"] = {**runs["jaxid"], "rms": runs["jaxid"]["own"]}
+        runs["own"] = {"rms": runs["jaxid"]["own"]}
+    made = [f"{name} on {run['date']} at {run['commit']}" for name, run in runs.items() if "commit" in run]
     left = {name: np.mean([run["rms"][m] for m in LEFT_OUT], axis=0) for name, run in runs.items()}
     lines = [
         "# SO-101 by an evolution strategy, and by jaxid",
         "",
-        f"Written by `python -m benchmarks.so101_cmaes` on {content['date']}, at {content['commit']}.",
+        f"Written by `python -m benchmarks.so101_cmaes`: {', '.join(made)}.",
         "Figures are RMS of simulated minus measured position in mrad, the mean over six motions left out:",
         f"{', '.join(LEFT_OUT)}.",
         f"Fitted: the first {ROWS} rows of {', '.join(FITTED)}, by all.",
@@ -284,8 +285,7 @@ def main() -> None:
     for fit in options.fit or [*FITS, "jaxid"]:
         run = by_jaxid(data) if fit == "jaxid" else by_strategy(data, FITS[fit])
         content = json.loads(kept.read_text()) if kept.exists() else {"runs": {"file": by_file(data)}}
-        content["runs"][fit] = run
-        content |= {"commit": commit_of(ROOT), "date": date.today().isoformat()}
+        content["runs"][fit] = {**run, "commit": commit_of(ROOT), "date": date.today().isoformat()}
         kept.write_text(json.dumps(content, indent=1) + "\n")
         (options.o / "so101_cmaes.md").write_text(table(content))
     print(table(json.loads(kept.read_text())))
