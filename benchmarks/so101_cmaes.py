@@ -1,10 +1,10 @@
 """SO-101 by an evolution strategy on MuJoCo rollouts, beside jaxid, on the same motions and the same machine.
 
-    JAXID_DATA=FOLDER python -m benchmarks.so101_cmaes [--fit pace|gains|jaxid]... [-o DIR]
+    JAXID_DATA=FOLDER python -m benchmarks.so101_cmaes [--fit pace|gains|stiff|jaxid]... [-o DIR]
 
 `pace` fits what PACE fits (armature, viscous damping, dry friction, a bias of the reading and a delay, for
-each joint) at the gains of the community's MJCF; `gains` fits kp and kv as well. `jaxid` is the command that
-corrects the MJCF. All see the first rows of three motions, and are scored by MuJoCo on six other motions.
+each joint) at the gains of the community's MJCF; `gains` fits kp and kv as well, and `stiff` does so with
+MuJoCo's dry friction as stiff as it can be. `jaxid` is the command that corrects the MJCF. All see the first rows of three motions, and are scored by MuJoCo on six other motions.
 Writes so101_cmaes.json and so101_cmaes.md.
 """
 
@@ -48,7 +48,11 @@ RANGES = {
     "kv": (1e-2, 100.0, "log"),
 }
 PACE = ("armature", "damping", "frictionloss", "bias", "delay")
-FITS = {"pace": PACE, "gains": (*PACE, "kp", "kv")}
+FITS = {"pace": PACE, "gains": (*PACE, "kp", "kv"), "stiff": (*PACE, "kp", "kv")}
+# MuJoCo's dry friction creeps under a load that friction would hold. Least with these: a time constant of two
+# steps, below which MuJoCo advises against it, and the largest impedance that it takes.
+SOLREF_FRICTION = (2 * STEP, 1.0)
+SOLIMP_FRICTION = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 # Evaluations of the three motions, and candidates in one generation.
 EVALUATIONS, POPULATION = 960, 16
 # The start is the middle of all ranges, with this standard deviation in units of a range.
@@ -152,9 +156,17 @@ def base_model(data: Path) -> mujoco.MjModel:
     return model
 
 
-def by_strategy(data: Path, names: Sequence[str]) -> dict[str, Any]:
+def stiffened(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a model whose dry friction is as stiff as it can be."""
+    model = copy.copy(model)
+    model.dof_solref[:], model.dof_solimp[:] = SOLREF_FRICTION, SOLIMP_FRICTION
+    return model
+
+
+def by_strategy(data: Path, fit: str) -> dict[str, Any]:
     """Fit by the evolution strategy; return times, values and RMS on all motions by name [mrad]."""
-    logs, base = motions(data), base_model(data)
+    logs, base, names = motions(data), base_model(data), FITS[fit]
+    base = stiffened(base) if fit == "stiff" else base
     begin, used = time.perf_counter(), time.process_time()
     values = evolve(base, [Course.of(logs[name][:ROWS]) for name in FITTED], names)
     seconds = {"seconds": time.perf_counter() - begin, "processor": time.process_time() - used}
@@ -191,6 +203,7 @@ def by_jaxid(data: Path) -> dict[str, Any]:
         "processor": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
         "converged": result["converged"],
         "rms": as_lists({name: replayed(model, motion) for name, motion in shown(logs).items()}),
+        "stiff": as_lists({name: replayed(stiffened(model), motion) for name, motion in shown(logs).items()}),
         "own": as_lists({name: 1e3 * np.array(own[name]["simulation"]) for name in LEFT_OUT}),
     }
 
@@ -223,12 +236,16 @@ def table(content: dict[str, Any]) -> str:
         "file": "the file as it is",
         "pace": "CMA-ES, PACE's parameters",
         "gains": "CMA-ES, kp and kv as well",
+        "stiff": "CMA-ES, these, stiff friction",
         "jaxid": "jaxid's file in MuJoCo",
+        "stiffened": "that, stiff friction",
         "own": "jaxid's own simulation",
     }
     runs = {name: content["runs"][name] for name in words if name in content["runs"]}
     if "jaxid" in runs:
+        runs["stiffened"] = {"rms": runs["jaxid"]["stiff"]}
         runs["own"] = {"rms": runs["jaxid"]["own"]}
+        runs = {name: runs[name] for name in words if name in runs}
     made = [f"{name} on {run['date']} at {run['commit']}" for name, run in runs.items() if "commit" in run]
     left = {name: np.mean([run["rms"][m] for m in LEFT_OUT], axis=0) for name, run in runs.items()}
     lines = [
@@ -241,7 +258,7 @@ def table(content: dict[str, Any]) -> str:
         f"CMA-ES (`cma`, population {POPULATION}) has {EVALUATIONS} evaluations of these, in one thread;",
         "each joint has its own strategy, and one rollout of MuJoCo carries a candidate of each. The time of",
         "jaxid is that of the whole command in a fresh process, with simulations of nine motions and replays",
-        "of them by MuJoCo.",
+        "of them by MuJoCo. Stiff friction: `solreffriction` of two steps and `solimpfriction` of 0.9999.",
         "",
         f"| joint | {' | '.join(words[name] for name in runs)} |",
         "|---" * (1 + len(runs)) + "|",
@@ -283,7 +300,7 @@ def main() -> None:
         parser.error("set JAXID_DATA to the folder of the measured data")
     data, kept = Path(os.environ["JAXID_DATA"]) / "so101", options.o / "so101_cmaes.json"
     for fit in options.fit or [*FITS, "jaxid"]:
-        run = by_jaxid(data) if fit == "jaxid" else by_strategy(data, FITS[fit])
+        run = by_jaxid(data) if fit == "jaxid" else by_strategy(data, fit)
         content = json.loads(kept.read_text()) if kept.exists() else {"runs": {"file": by_file(data)}}
         content["runs"][fit] = {**run, "commit": commit_of(ROOT), "date": date.today().isoformat()}
         kept.write_text(json.dumps(content, indent=1) + "\n")
