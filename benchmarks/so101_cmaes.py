@@ -4,7 +4,8 @@
 
 `pace` fits what PACE fits (armature, viscous damping, dry friction, a bias of the reading and a delay, for
 each joint) at the gains of the community's MJCF; `gains` fits kp and kv as well, and `stiff` does so with
-MuJoCo's dry friction as stiff as it can be. `jaxid` is the command that corrects the MJCF. All see the first rows of three motions, and are scored by MuJoCo on six other motions.
+MuJoCo's dry friction as stiff as it can be. `jaxid` is the command that corrects the MJCF. All see the first
+rows of three motions, and are scored by MuJoCo on six other motions.
 Writes so101_cmaes.json and so101_cmaes.md.
 """
 
