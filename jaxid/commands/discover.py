@@ -30,6 +30,7 @@ from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_force, need_known_controller, need_known_reference
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
+from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
@@ -176,7 +177,7 @@ def explore(
         effects=found.effects,
         rounds=_as_refitted([_round(search, s) for s in steps], old, new, len(session.fits)),
         before=before,
-        after=found.estimate,
+        after=with_effort(found.estimate, session, new, searched=True),
         gaps_before=old,
         gaps_after=new,
         noise_floor=search.floor,

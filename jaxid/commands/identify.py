@@ -219,7 +219,8 @@ def _checked_options(
 
 def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[Estimate]:
     """Fit by a method; beside inverse dynamics, test whether noise in a known loop biases it."""
-    estimate = yield from steps_of(method, session, **options)
+    more = {"scaled": True} if method == "output_error" else {}
+    estimate = yield from steps_of(method, session, **options, **more)
     if method != "inverse_dynamics" or session.more:
         return estimate
     return (yield from with_loop_noise(session, estimate))

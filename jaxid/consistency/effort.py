@@ -23,10 +23,11 @@ from jaxid.numerics.misspecified import std_under_misspecification
 _LONGEST, _PART = 0.5, 0.05
 # Points of the search along each of the two, from which the best one is refined.
 _POINTS = 13
-# Ripples that the search of a magnitude starts from, and the largest one, over the RMS of the force.
-_RIPPLES, _LARGEST = (0.0, 0.3, 1.0), 5.0
-# Part of a range that counts as one of its ends, and step of the derivatives there.
-_END = 1e-3
+# Ripples over the RMS of the force from which the search of a magnitude starts; the last one is the largest.
+_RIPPLES = (0.0, 0.3, 1.0)
+# Part of a range that counts as one of its ends, and step of the derivatives there; and part of a sample by
+# which a delay must differ from none.
+_END, _SAMPLE = 1e-3, 0.1
 # Efforts with the spectrum of the logged one and random phases; the largest agreement of so many is passed by
 # chance once in a hundred times.
 _DRAWN = 99
@@ -69,6 +70,8 @@ class Witness:
         offset: Effort without force.
         std: Standard deviations of gain, offset, delay, lag and ripple, (5,); NaN for one of the last
             three at zero or at the end of the search.
+        bent: Whether the effort of a large force grows faster than in proportion, so that it has no one gain:
+            the ripple, which makes a magnitude flat at small forces, is at the end of the search.
     """
 
     shape: Shape
@@ -77,6 +80,7 @@ class Witness:
     gain: float
     offset: float
     std: Float[np.ndarray, " 5"]
+    bent: bool = False
 
     @property
     def agrees(self) -> bool:
@@ -147,7 +151,7 @@ def witness(
         return None
     longest = min(_LONGEST, _PART * period * effort.size)
     size = float(np.sqrt(np.mean(force**2)))
-    ends = np.array([longest, longest, _LARGEST * size][: 3 if unsigned else 2])
+    ends = np.array([longest, longest, _RIPPLES[-1] * size][: 3 if unsigned else 2])
     steps = np.linspace(0.0, longest, _POINTS)
     ripples = size * np.array(_RIPPLES if unsigned else (0.0,))
     grid = np.array([(d, t, r)[: ends.size] for r in ripples for d in steps for t in steps])
@@ -171,13 +175,17 @@ def witness(
     if unsigned and gain <= 0.0:
         agreement = 0.0
 
-    slopes, inside = _slopes(shaped, at, ends)
+    none = np.array([_SAMPLE * period, _SAMPLE * period, 0.0])[: ends.size]
+    inside = (np.maximum(none, 2.0 * _END * ends) < at) & (at < (1.0 - 2.0 * _END) * ends)
+    slopes = _slopes(shaped, at, ends)
     jacobian = np.stack([shaped(at), np.ones(effort.size), *(gain * slopes)], axis=1)
     kept = np.array([True, True, *inside])
     std = np.full(5, np.nan)
     counts = np.ones((effort.size, 1), bool)
     std[: kept.size][kept] = std_under_misspecification(jacobian[:, None, kept], residual[:, None], counts)
-    return Witness(Shape(unsigned, *map(float, at)), agreement, float(np.max(drawn)), gain, offset, std)
+    bent = unsigned and bool(at[2] >= (1.0 - 2.0 * _END) * ends[2])
+    shape = Shape(unsigned, *map(float, at))
+    return Witness(shape, agreement, float(np.max(drawn)), gain, offset, std, bent)
 
 
 def _fitted(effort: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, float, float]:
@@ -187,16 +195,14 @@ def _fitted(effort: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, float, f
     return effort - table @ (gain, offset), float(gain), float(offset)
 
 
-def _slopes(
-    shaped: Callable[[np.ndarray], np.ndarray], at: np.ndarray, ends: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of a shape by its values, (values, time), and which are inside their ranges."""
+def _slopes(shaped: Callable[[np.ndarray], np.ndarray], at: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Return the derivatives of a shape by its values, (values, time)."""
     slopes = []
     for k, end in enumerate(ends):
         step = _END * end * (np.arange(ends.size) == k)
         low, high = np.maximum(at - step, 0.0), np.minimum(at + step, ends)
         slopes.append((shaped(high) - shaped(low)) / (high[k] - low[k]))
-    return np.stack(slopes), (2.0 * _END * ends < at) & (at < (1.0 - 2.0 * _END) * ends)
+    return np.stack(slopes)
 
 
 def _standard(signal: np.ndarray) -> np.ndarray:

@@ -58,6 +58,7 @@ def _output_error(
     numerics: Numerics | None = None,
     hessian: bool | None = None,
     profile: Sequence[str] | None = None,
+    scaled: bool = False,
 ) -> Steps[Estimate]:
     case, log = session.case, session.fit.log
     stated = case.output_error
@@ -90,7 +91,7 @@ def _output_error(
     if session.machine.unforced(log):
         from jaxid.estimators.unforced import unforced_steps
 
-        return (yield from unforced_steps(session, **options))
+        return (yield from unforced_steps(session, scaled=scaled, **options))
     start = yield from _start(session)
     options["solver"] = solver
     logs = parts_of(session) if session.more else log

@@ -96,17 +96,20 @@ def simulated_force(machine: Machine, log: Log) -> np.ndarray | None:
     return None if gap is None or gap.command is None else gap.command * machine.gain
 
 
-def with_effort(estimate: Estimate, session: Session, gaps: Sequence[Gap]) -> Estimate:
+def with_effort(
+    estimate: Estimate, session: Session, gaps: Sequence[Gap], *, searched: bool = False
+) -> Estimate:
     """Return an estimate with what each effort says beside it, as notes and under `effort` of its details.
 
     Args:
         estimate: The estimate.
         session: Case and logs of the fit.
         gaps: Gaps of the estimate, those of the fitted logs first.
+        searched: Whether the estimate is that of a search, which takes no scale from an effort.
     """
     said: list[dict[str, Any]] = []
     for run, gap in zip(session.fits, gaps, strict=False):
-        said += _said_of(estimate, session, run, gap)
+        said += _said_of(estimate, session, run, gap, searched)
     if not said:
         return estimate
     named = len(session.fits) > 1
@@ -114,7 +117,9 @@ def with_effort(estimate: Estimate, session: Session, gaps: Sequence[Gap]) -> Es
     return replace(estimate, notes=(*estimate.notes, *notes), details={**estimate.details, "effort": said})
 
 
-def _said_of(estimate: Estimate, session: Session, run: OpenedLog, gap: Gap) -> list[dict[str, Any]]:
+def _said_of(
+    estimate: Estimate, session: Session, run: OpenedLog, gap: Gap, searched: bool
+) -> list[dict[str, Any]]:
     """Return an entry for each drive of a log with an effort."""
     log = run.log
     if log.effort is None:
@@ -124,7 +129,7 @@ def _said_of(estimate: Estimate, session: Session, run: OpenedLog, gap: Gap) -> 
     for drive in range(log.effort.shape[1]):
         force, missing = _force(session, machine, log, gap)
         own = None if force is None else _of_drive(log, table, force, drive)
-        use, why = _use(estimate, own, _gain(table, drive), missing)
+        use, why = _use(estimate, own, _gain(table, drive), missing, searched)
         unit = f"1/({machine.unit('force', machine.plant.driven(machine.plant.joints)[drive])})"
         free = "relative" in estimate.details
         out.append(
@@ -161,8 +166,8 @@ def _gain(table: LogTable, drive: int) -> float | None:
 
 
 def _follows(own: Witness) -> bool:
-    """Check that most of an effort is the force's, beyond chance, and that its gain has a precision."""
-    return own.agrees and own.agreement >= ENOUGH and bool(own.std[0] > 0.0)
+    """Check that most of an effort is the force's, beyond chance, and that it has a gain with a precision."""
+    return own.agrees and own.agreement >= ENOUGH and not own.bent and bool(own.std[0] > 0.0)
 
 
 def _nudged(part: Part, estimate: Estimate) -> dict[int, tuple[float, np.ndarray]]:
@@ -177,7 +182,9 @@ def _nudged(part: Part, estimate: Estimate) -> dict[int, tuple[float, np.ndarray
     return out
 
 
-def _use(estimate: Estimate, own: Witness | None, gain: float | None, missing: str) -> tuple[str, str]:
+def _use(
+    estimate: Estimate, own: Witness | None, gain: float | None, missing: str, searched: bool
+) -> tuple[str, str]:
     """Return what an effort is used for (scale, check or nothing), and why."""
     if own is None:
         return "nothing", missing or "it is constant, or the force is"
@@ -185,12 +192,14 @@ def _use(estimate: Estimate, own: Witness | None, gain: float | None, missing: s
         return "nothing", "it agrees with the force no better than chance"
     if own.agreement < ENOUGH:
         return "nothing", "most of it is something else than the force, so that its gain may be off"
+    if own.bent:
+        return "nothing", "it grows faster than in proportion to the force, so that it has no one gain"
     if "relative" in estimate.details:
         if gain is None:
-            return (
-                "nothing",
-                "its gain is not known, so that it gives no scale: state [log] effort_gain if it is",
-            )
+            why = "its gain is not known, so that it gives no scale: state [log] effort_gain if it is"
+            return "nothing", why
+        if searched:
+            return "nothing", "a search leaves the scale open; identify takes it from effort_gain"
         return "nothing", "its sign is opposite to that of effort_gain, or its gain has no precision"
     if estimate.details.get(SCALE, {}).get("from") == "effort" and gain is not None:
         return "scale", "its gain is stated, and nothing else gives the scale"

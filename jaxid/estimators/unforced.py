@@ -44,7 +44,9 @@ _RENEWALS = 2
 _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
 
 
-def unforced_steps(session: Session, *, numerics: Numerics | None = None, **options: Any) -> Steps[Estimate]:
+def unforced_steps(
+    session: Session, *, numerics: Numerics | None = None, scaled: bool = False, **options: Any
+) -> Steps[Estimate]:
     """Fit the positions of loops whose force was not logged, from several starts, to one log or to several.
 
     The joints of an arm are fitted one by one if each has a servo, see `jaxid.estimators.apart`.
@@ -52,6 +54,7 @@ def unforced_steps(session: Session, *, numerics: Numerics | None = None, **opti
     Args:
         session: Case and logs of the fit.
         numerics: Settings of the integration; None: chosen from machine and log.
+        scaled: Whether an effort of known gain gives the scale, if nothing else does.
         options: Further arguments of `output_error_steps`.
     """
     machine = session.machine
@@ -75,7 +78,7 @@ def unforced_steps(session: Session, *, numerics: Numerics | None = None, **opti
         result = noisy or result
     if base is None:
         return result
-    scale = scale_by_effort(session, parts, result)
+    scale = scale_by_effort(session, parts, result) if scaled else None
     if scale is not None:
         return with_known_scale(result, machine, group, base, scale)
     return with_free_scale(result, machine, group, base)

@@ -20,6 +20,7 @@ from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Step
 from jaxid.estimators import steps_of
+from jaxid.estimators.effort import with_effort
 from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.estimators.within_prior.fit import within_prior_steps
 from jaxid.gap import gaps, noise_floor
@@ -95,7 +96,7 @@ def explore_within(session: Session, *, max_effects: int, progress: Callable[[st
         effects=tuple(effects),
         rounds=tuple(rounds),
         before=first,
-        after=last,
+        after=with_effort(last, session, new, searched=True),
         gaps_before=old,
         gaps_after=new,
         noise_floor=floor,

@@ -24,6 +24,7 @@ from jaxid.discovery.where import Where
 from jaxid.errors import InputError
 from jaxid.estimators import steps_of
 from jaxid.estimators.coarse_starts import coarse_starts
+from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import parts_of
@@ -88,7 +89,7 @@ def explore_unforced(session: Session, *, max_effects: int, progress: Callable[[
         effects=effects,
         rounds=_rounds(search, steps, old, new),
         before=before,
-        after=after,
+        after=with_effort(after, session, new, searched=True),
         gaps_before=old,
         gaps_after=new,
         noise_floor=np.full(session.machine.plant.joints, np.nan),
