@@ -2,8 +2,8 @@
 
     JAXID_DATA=FOLDER python -m benchmarks.so101_effort [-o DIR]
 
-Each joint is fitted to one motion from command and encoder alone, as in `benchmarks.so101`. The load column, a
-magnitude, stands beside the log as `[log] effort`. Writes so101_effort.json and so101_effort.md.
+Each joint is fitted to one motion from command and encoder alone, as in `benchmarks.so101`. The load column,
+a magnitude, stands beside the log as `[log] effort`. Writes so101_effort.json and so101_effort.md.
 """
 
 import argparse
@@ -40,10 +40,10 @@ def table(content: dict[str, Any]) -> str:
         "# The load of the SO-101's servos beside the fitted force",
         "",
         f"Written by `python -m benchmarks.so101_effort` on {content['date']}, at {content['commit']}.",
-        f"Each joint is fitted to the first {ROWS} rows of {MOTION} without a force; the load is a magnitude.",
-        "The scale of the forces is that of the file's inertia of the rotor, 0.028 kg m^2.",
+        f"Each joint is fitted to the first {ROWS} rows of {MOTION} alone; the load is a magnitude.",
+        "The scale of the forces is that of the file's inertia of the rotor, 0.028 kg m^2. Gain: load over force.",
         "",
-        "| joint | variance that the force explains | by chance up to | gain | delay [ms] | lag [ms] | verdict |",
+        "| joint | variance explained | by chance up to | gain | delay [ms] | lag [ms] | used for |",
         "|---|---|---|---|---|---|---|",
     ]
     for entry in content["joints"]:

@@ -170,13 +170,15 @@ def witness(
     start = np.clip(best, _END * ends, (1.0 - _END) * ends)
     found = scipy.optimize.least_squares(left, start, bounds=(0.0, ends), x_scale=ends, diff_step=_END)
     at = min((best, found.x), key=lambda at: float(np.sum(left(at) ** 2)))
+    # What cannot be told from none is none.
+    none = np.maximum(2.0 * _END * ends, np.array([_SAMPLE * period, _SAMPLE * period, 0.0])[: ends.size])
+    at = np.where(at < none, 0.0, at)
     residual, gain, offset = _fitted(effort, shaped(at))
     agreement = 1.0 - float(np.mean(residual**2) / np.var(effort))
     if unsigned and gain <= 0.0:
         agreement = 0.0
 
-    none = np.array([_SAMPLE * period, _SAMPLE * period, 0.0])[: ends.size]
-    inside = (np.maximum(none, 2.0 * _END * ends) < at) & (at < (1.0 - 2.0 * _END) * ends)
+    inside = (at > 0.0) & (at < (1.0 - 2.0 * _END) * ends)
     slopes = _slopes(shaped, at, ends)
     jacobian = np.stack([shaped(at), np.ones(effort.size), *(gain * slopes)], axis=1)
     kept = np.array([True, True, *inside])
