@@ -18,6 +18,7 @@ from jaxid.errors import InputError
 from jaxid.export.exported import ExportedFile, JointLaws, need_joints, plant_of, shown
 from jaxid.export.mjcf_behind import BEHIND, BehindJoints
 from jaxid.export.mjcf_drives import DRIVE_EFFECTS, DriveText
+from jaxid.export.soft_friction import Softness
 from jaxid.export.xml_text import Element, XmlText
 
 # Relative change below which a value of the file stays as it is written.
@@ -161,6 +162,7 @@ class _Work:
             self._add(values, "armature", index, armature, stated.armature)
             level = law.get("coulomb_friction", 0.0) - stated.friction
             self._add(values, "frictionloss", index, level, stated.friction)
+            self._harden(values, index)
             self._damping(values, joint, stated, law, index)
             self._spring(values, joint, stated, law, index)
             if values:
@@ -193,6 +195,13 @@ class _Work:
             self.notes.append(f"{attribute} of joint '{self.names[joint]}' would be {new:.3g}: written as 0")
             new = 0.0
         values[attribute] = repr(new)
+
+    def _harden(self, values: dict[str, str | None], joint: int) -> None:
+        """Let a dry friction that is written hold its joint at rest, as jaxid's does."""
+        if float(values.get("frictionloss") or 0.0) > 0:
+            least = Softness.least(float(self.compiled.opt.timestep))
+            if Softness.of(self.compiled, self._dof(joint)).softer(least):
+                values |= least.attributes()
 
     def _damping(
         self, values: dict[str, str | None], joint: RobotJoint, stated: RobotJoint, law: dict, index: int

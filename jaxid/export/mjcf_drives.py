@@ -172,7 +172,7 @@ class DriveText:
             self.text.set(self.joints[joint], {"actuatorfrcrange": f"{-limit!r} {limit!r}"})
 
     def _delay(self, place: tuple[int, Element], delay: float) -> None:
-        """Write a delay, with a memory that is long enough for it."""
+        """Write a delay, with a memory that is long enough for it, and lines between its samples."""
         index, compiled = place[0], self.compiled
         if _same(delay, float(compiled.actuator_delay[index])):
             return
@@ -180,6 +180,8 @@ class DriveText:
         values = {"delay": repr(delay)}
         if int(compiled.actuator_history[index, 0]) < needed:
             values["nsample"] = str(needed)
+        if delay > 0 and int(compiled.actuator_history[index, 1]) == 0:
+            values["interp"] = "linear"
         self._set(place, values)
 
 

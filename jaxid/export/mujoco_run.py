@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,12 @@ from jaxid.case.robot import Robot, kept
 from jaxid.controllers import Path as Reference
 from jaxid.controllers import Tick
 from jaxid.errors import InputError
+from jaxid.export.soft_friction import Softness
 from jaxid.references.unknown import UnknownReference
 from jaxid.simulation.replay import Replay
 
+# Factor by which the time step of a file is shortened to see what it costs.
+FINER = 10
 # Inertia of a joint that is held [kg m^2 or kg]: forces of a robot do not move it.
 _HELD = 1e12
 
@@ -31,13 +34,13 @@ class Setting:
     """Choices of a run that a file leaves to its user.
 
     Args:
-        finer: Factor by which the time step of the file is shortened.
-        stiff: Whether dry friction is as stiff as the time step allows, in place of the file's softness.
+        finer: Factor by which the time step of the file is shortened, at most `FINER`.
+        softness: Softness of the dry friction of joints, by name, in place of the file's.
         locked: Names of joints that stand still.
     """
 
     finer: int = 1
-    stiff: bool = False
+    softness: Mapping[str, Softness] = field(default_factory=dict)
     locked: tuple[str, ...] = ()
 
 
@@ -63,6 +66,13 @@ class MujocoRobot:
     gains: Float[np.ndarray, " m"]
     drives: tuple[int, ...]
 
+    @property
+    def softness(self) -> dict[str, Softness]:
+        """Softness of the dry friction of the free joints that have some, by name."""
+        dofs = {joint.name: int(self.model.joint(joint.name).dofadr[0]) for joint in self.robot.free}
+        rubs = self.model.dof_frictionloss
+        return {name: Softness.of(self.model, dof) for name, dof in dofs.items() if rubs[dof] > 0}
+
     def motion(self, replay: Replay, setting: Setting = Setting()) -> Float[np.ndarray, "time n"]:
         """Return the positions of the free joints at the samples of a replay's log.
 
@@ -72,19 +82,19 @@ class MujocoRobot:
         """
         mujoco = need_mujoco(self.robot.file)
         model, period = self.model, replay.drive.period
-        step, solref = float(model.opt.timestep), model.dof_solref.copy()
-        rotors = model.dof_armature.copy()
+        step, rotors = float(model.opt.timestep), model.dof_armature.copy()
+        solref, solimp = model.dof_solref.copy(), model.dof_solimp.copy()
         count = max(1, round(period / step)) * setting.finer
         try:
             model.opt.timestep = period / count
-            if setting.stiff:
-                model.dof_solref[:] = [2.0 * model.opt.timestep, 1.0]
+            for name, softness in setting.softness.items():
+                softness.put(model, int(model.joint(name).dofadr[0]))
             for name in setting.locked:
                 model.dof_armature[model.joint(name).dofadr] = _HELD
             return _Run(mujoco, self, replay, count).positions()
         finally:
-            model.opt.timestep, model.dof_solref[:] = step, solref
-            model.dof_armature[:] = rotors
+            model.opt.timestep, model.dof_armature[:] = step, rotors
+            model.dof_solref[:], model.dof_solimp[:] = solref, solimp
 
 
 def load(
@@ -113,7 +123,11 @@ def load(
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".jaxid-", suffix=path.suffix) as file:
             file.write(content)
             file.flush()
-            whole, model = robot_of_spec(mujoco.MjSpec.from_file(file.name), str(path))
+            spec = mujoco.MjSpec.from_file(file.name)
+            # A delay must fit into its memory at the shortest time step too.
+            for actuator in spec.actuators:
+                actuator.nsample *= 2 * FINER
+            whole, model = robot_of_spec(spec, str(path))
     except OSError as error:
         what = f"cannot be replayed: no file can be written beside it ({error.strerror})"
         raise InputError(what, where=str(path), hint="copy it and its parts to a folder of yours") from error

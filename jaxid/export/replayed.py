@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,24 +11,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.case.case import Case
-from jaxid.errors import InputError
-from jaxid.export.exported import ExportedFile, shown
-from jaxid.export.found_machine import case_of, found_machine, without_effects
-from jaxid.export.mujoco_run import MujocoRobot, Setting, load
-from jaxid.gap import simulation_gap
+from jaxid.export.exported import ExportedFile
+from jaxid.export.followed import STRETCH, Followed, listed, rms
+from jaxid.export.found_machine import case_of, found_machine
+from jaxid.export.mujoco_run import MujocoRobot, load
 from jaxid.logs.in_memory import LogLike
-from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.results.aligned import aligned
 from jaxid.session import open_session
-from jaxid.simulation.replay import Replay, exact_numerics, make_replay, with_fitted_start
-from jaxid.simulation.step_size import TooStiffError
-
-# Length of the stretches after which an open loop starts anew from the log [s]: errors of the start of an arm
-# that stands upright grow with a time constant of about 0.15 s.
-_STRETCH = 0.25
-# Factor by which the time step of the file is shortened to see what it costs.
-_FINER = 10
 
 
 @dataclass(frozen=True)
@@ -73,10 +63,7 @@ class Replayed:
             rows.append([f"{name} [{self.units[k]}]", *(f"{x:.3g}" for x in sizes), share])
         lines = [f"replay by MuJoCo, {how}: RMS from the log, by joint", aligned(rows)]
         for text, sizes in self.costs:
-            listed = ", ".join(
-                f"{n} {x:.2g} {u}" for n, x, u in zip(self.joints, sizes, self.units, strict=True)
-            )
-            lines.append(f"{text}: {listed}")
+            lines.append(f"{text}: {listed(self.joints, self.units, sizes)}")
         return "\n".join(lines)
 
 
@@ -101,28 +88,22 @@ def replay_export(
     """
     case = _alone(case_of(model, where))
     session = open_session(case, log)
-    machine, measured = session.machine, session.fit.log
-    found = found_machine(model, case, machine)
-    replay, position = _simulated(found, measured)
-
-    def robot(content: bytes, added: tuple[str, ...] = ()) -> MujocoRobot:
-        return mujoco_robot(content, path, model, case, found, added)
-
-    ours, theirs = robot(exported.content, exported.added), robot(path.read_bytes())
-    motion, before = ours.motion(replay), theirs.motion(replay)
-    for what, values in (("the exported file", motion), ("your file", before)):
-        if not np.all(np.isfinite(values)):
-            raise InputError(f"MuJoCo's simulation of {what} diverges on {measured.source}", where=str(path))
+    machine = found_machine(model, case, session.machine)
+    shared = (path, model, case, machine)
+    users = mujoco_robot(path.read_bytes(), *shared)
+    ours = mujoco_robot(exported.content, *shared, exported.added)
+    followed = Followed.of(machine, session.fit.log, users, ours)
+    measured = followed.log.position
     return Replayed(
         joints=tuple(model["joints"]),
-        units=tuple(machine.unit("position", k) for k in range(len(model["joints"]))),
-        before=rms(measured.position - before),
-        after=rms(measured.position - motion),
-        own=rms(measured.position - position),
-        difference=rms(motion - position),
-        costs=tuple(_costs(model, exported, found, measured, position, ours, replay, motion)),
-        closed=replay.controller is not None,
-        stretch=_STRETCH,
+        units=tuple(session.machine.unit("position", k) for k in range(len(model["joints"]))),
+        before=rms(measured - followed.before),
+        after=rms(measured - followed.after),
+        own=rms(measured - followed.own),
+        difference=rms(followed.after - followed.own),
+        costs=(*followed.lacks(model, exported), followed.time_step()),
+        closed=followed.replay.controller is not None,
+        stretch=STRETCH,
     )
 
 
@@ -131,25 +112,6 @@ def _alone(case: Case) -> Case:
     identification = replace(case.identification, per_log=())
     tables = {k: v for k, v in case.tables.items() if k not in ("fit", "validation")}
     return replace(case, fits=(), validations=(), identification=identification, tables=tables)
-
-
-def _simulated(machine: Machine, log: Log) -> tuple[Replay, np.ndarray]:
-    """Return the replay of a log, and the positions that jaxid simulates.
-
-    Raises:
-        InputError: If the simulation cannot run, or diverges.
-    """
-    try:
-        numerics = exact_numerics(machine, log)
-    except TooStiffError as error:
-        raise InputError(f"jaxid cannot simulate this log: {error}", where=log.source) from error
-    if machine.controller is None:
-        numerics = replace(numerics, segment=max(2, round(_STRETCH / log.period)))
-    replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
-    position = simulation_gap(machine, replay, log).position
-    if not np.all(np.isfinite(position)):
-        raise InputError("jaxid's simulation of this log diverges", where=log.source)
-    return replay, position
 
 
 def mujoco_robot(
@@ -172,36 +134,3 @@ def mujoco_robot(
     gains = np.array([np.nan if d is None or d.kp is not None else d.gain for d in of_file])
     driven = bool(taken and not servo and np.allclose(gains, machine.gain, rtol=1e-9))
     return MujocoRobot(compiled, robot, held, bool(servo), driven, np.asarray(machine.gain), drives)
-
-
-def _costs(
-    model: Mapping[str, Any],
-    exported: ExportedFile,
-    machine: Machine,
-    log: Log,
-    position: np.ndarray,
-    robot: MujocoRobot,
-    replay: Replay,
-    motion: np.ndarray,
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Return the changes by each effect that the file lacks, by MuJoCo's step, and by its soft friction."""
-    for number in exported.lost:
-        less = without_effects(machine, {number})
-        try:
-            changed = _simulated(less, log)[1]
-        except InputError:
-            continue
-        yield f"without {shown(model['effects'][number])}", rms(changed - position)
-    for name in exported.added:
-        stiff = robot.motion(replay, Setting(locked=(name,)))
-        yield f"without the second joint '{name}'", rms(stiff - motion)
-    fine = robot.motion(replay, Setting(finer=_FINER))
-    yield f"time step of {robot.model.opt.timestep:g} s, against a {_FINER}th", rms(fine - motion)
-    if np.any(robot.model.dof_frictionloss > 0):
-        stiff = robot.motion(replay, Setting(finer=_FINER, stiff=True))
-        yield "soft dry friction (solreffriction), against stiff", rms(stiff - fine)
-
-
-def rms(off: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Return the root mean square of each column, (n,); a missing reading is NaN."""
-    return np.sqrt(np.nanmean(off**2, axis=0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.errors import InputError
 from jaxid.export.exported import ExportedFile
-from jaxid.export.replayed import mujoco_robot, rms
+from jaxid.export.followed import Followed, listed, rms
+from jaxid.export.replayed import mujoco_robot
 from jaxid.results.aligned import aligned
-from jaxid.simulation.replay import exact_numerics, make_replay
 
 if TYPE_CHECKING:
     from jaxid.commands.identify import Identification
@@ -22,14 +21,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ServoReplay:
-    """Logs that MuJoCo has followed from their references alone.
+    """Logs that MuJoCo has followed from their references alone; all values are RMS by joint [m or rad].
 
     Args:
         joints: Names of the joints.
         units: Unit of each joint's position.
         logs: Names of the logs.
-        before: RMS of measured less simulated position of the user's file, (logs, n) [m or rad].
-        after: RMS of that of the exported file.
+        before: Measured less simulated position of the user's file, (logs, n).
+        after: That of the exported file.
+        difference: Exported file in MuJoCo less jaxid's simulation, (logs, n).
+        lacks: Things that the file cannot hold: a sentence, and what each moves, (logs, n).
     """
 
     joints: tuple[str, ...]
@@ -37,13 +38,35 @@ class ServoReplay:
     logs: tuple[str, ...]
     before: Float[np.ndarray, "logs n"]
     after: Float[np.ndarray, "logs n"]
+    difference: Float[np.ndarray, "logs n"]
+    lacks: Mapping[str, Float[np.ndarray, "logs n"]]
 
     def __str__(self) -> str:
+        changed = [
+            [f"{b:.3g} -> {a:.3g}" for b, a in zip(before, after, strict=True)]
+            for before, after in zip(1e3 * self.before, 1e3 * self.after, strict=True)
+        ]
+        apart = [[f"{x:.2g}" for x in row] for row in 1e3 * self.difference]
+        lines = [
+            "replay by MuJoCo: RMS from the log, your file -> exported",
+            self._table(changed),
+            "",
+            "exported file in MuJoCo less jaxid's simulation, RMS",
+            self._table(apart),
+        ]
+        if self.lacks:
+            lines += [
+                "",
+                "what single things move a joint, on the log where it is most, RMS",
+            ]
+        for what, sizes in self.lacks.items():
+            lines.append(f"{what}: {listed(self.joints, self.units, np.nanmax(sizes, axis=0))}")
+        return "\n".join(lines)
+
+    def _table(self, rows: Sequence[Sequence[str]]) -> str:
+        """Return rows of text, one a log, with their heads."""
         heads = ["log", *(f"{name} [m{unit}]" for name, unit in zip(self.joints, self.units, strict=True))]
-        rows = [heads]
-        for name, before, after in zip(self.logs, 1e3 * self.before, 1e3 * self.after, strict=True):
-            rows.append([name, *(f"{b:.3g} -> {a:.3g}" for b, a in zip(before, after, strict=True))])
-        return "replay by MuJoCo: RMS from the log, your file -> exported\n" + aligned(rows)
+        return aligned([heads, *([name, *row] for name, row in zip(self.logs, rows, strict=True))])
 
 
 def replay_servos(
@@ -62,16 +85,19 @@ def replay_servos(
     """
     session, fitted = result.session, result.estimate.machine
     shared = (path, model, session.declared, fitted)
-    robots = mujoco_robot(path.read_bytes(), *shared), mujoco_robot(exported.content, *shared, exported.added)
-    off = []
-    for run in session.runs:
-        machine = run.machine(fitted)
-        replay = make_replay(machine, run.log, exact_numerics(machine, run.log))
-        motions = [robot.motion(replay) for robot in robots]
-        if not np.all(np.isfinite(motions)):
-            raise InputError(f"MuJoCo's simulation diverges on {run.log.source}", where=str(path))
-        off.append([rms(run.log.position - motion) for motion in motions])
-    before, after = np.moveaxis(np.array(off), 1, 0)
-    joints = tuple(model["joints"])
-    units = tuple(fitted.unit("position", k) for k in range(len(joints)))
-    return ServoReplay(joints, units, tuple(run.name for run in session.runs), before, after)
+    users = mujoco_robot(path.read_bytes(), *shared)
+    ours = mujoco_robot(exported.content, *shared, exported.added)
+    every = [Followed.of(run.machine(fitted), run.log, users, ours) for run in session.runs]
+    lacks = [dict(followed.lacks(model, exported)) for followed in every]
+    # An effect without which one of the logs cannot be simulated has no size there.
+    none = np.full(len(model["joints"]), np.nan)
+    names = dict.fromkeys(what for one in lacks for what in one)
+    return ServoReplay(
+        joints=tuple(model["joints"]),
+        units=tuple(fitted.unit("position", k) for k in range(len(model["joints"]))),
+        logs=tuple(run.name for run in session.runs),
+        before=np.array([rms(f.log.position - f.before) for f in every]),
+        after=np.array([rms(f.log.position - f.after) for f in every]),
+        difference=np.array([rms(f.after - f.own) for f in every]),
+        lacks={what: np.array([one.get(what, none) for one in lacks]) for what in names},
+    )
