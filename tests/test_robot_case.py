@@ -120,9 +120,14 @@ def test_servos_without_a_force_end_in_the_robots_file(folder, capsys):
     # The user's own file stays as it was.
     assert 'kp="3000"' in (folder / "robot.xml").read_text()
     # A row of the table: the log, then a pair for each joint.
-    [line] = [line for line in ran.out.splitlines() if line.split()[2:3] == ["->"]]
+    lines = ran.out.splitlines()
+    [line] = [line for line in lines if line.split()[2:3] == ["->"]]
     before, after = (float(x) for x in line.split()[1:4:2])
     assert before > 10 * after
+    # MuJoCo follows the log as jaxid does, to less than a milliradian.
+    at = lines.index("exported file in MuJoCo less jaxid's simulation, RMS")
+    assert all(float(x) < 1.0 for x in lines[at + 2].split()[1:])
+    assert "creep that the exported file's dry friction leaves" in ran.out
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from jaxid.export.soft_friction import Softness
 from jaxid.gap import simulation_gap
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
+from jaxid.results.aligned import aligned
 from jaxid.simulation.replay import Replay, exact_numerics, make_replay, with_fitted_start
 from jaxid.simulation.step_size import TooStiffError
 
@@ -96,7 +97,7 @@ class Followed:
         kept = {name: Softness.of(theirs, int(theirs.joint(name).dofadr[0])) for name in ours}
         if any(kept[name].softer(softness) for name, softness in ours.items()):
             moved = self.robot.motion(self.replay, Setting(softness=kept))
-            yield "with the creep of your file's dry friction (solreffriction)", rms(moved - self.after)
+            yield "creep of your file's dry friction (solreffriction)", rms(moved - self.after)
         # None can be stiffer; what a little creep moves is in proportion to it.
         least = Softness.least(float(self.robot.model.opt.timestep))
         soft = any(softness.softer(least) for softness in ours.values())
@@ -135,6 +136,9 @@ def rms(off: np.ndarray) -> Float[np.ndarray, " n"]:
     return np.sqrt(np.nanmean(off**2, axis=0))
 
 
-def listed(joints: tuple[str, ...], units: tuple[str, ...], sizes: np.ndarray) -> str:
-    """Return a size by joint in words, in thousandths of its unit."""
-    return ", ".join(f"{n} {1e3 * x:.2g} m{u}" for n, x, u in zip(joints, sizes, units, strict=True))
+def lacks_table(
+    heading: str, joints: Sequence[str], units: Sequence[str], lacks: Iterable[tuple[str, np.ndarray]]
+) -> str:
+    """Return what single things move as text, a row each, by joint in thousandths of its unit."""
+    heads = [heading, *(f"{name} [m{unit}]" for name, unit in zip(joints, units, strict=True))]
+    return aligned([heads, *([what, *(f"{1e3 * x:.2g}" for x in sizes)] for what, sizes in lacks)])

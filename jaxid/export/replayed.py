@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxid.case.case import Case
 from jaxid.export.exported import ExportedFile
-from jaxid.export.followed import STRETCH, Followed, listed, rms
+from jaxid.export.followed import STRETCH, Followed, lacks_table, rms
 from jaxid.export.found_machine import case_of, found_machine
 from jaxid.export.mujoco_run import MujocoRobot, load
 from jaxid.logs.in_memory import LogLike
@@ -61,10 +61,8 @@ class Replayed:
             share = "-" if np.isnan(self.share[k]) else f"{100 * self.share[k]:.2g} %"
             sizes = (x[k] for x in (self.before, self.after, self.own, self.difference))
             rows.append([f"{name} [{self.units[k]}]", *(f"{x:.3g}" for x in sizes), share])
-        lines = [f"replay by MuJoCo, {how}: RMS from the log, by joint", aligned(rows)]
-        for text, sizes in self.costs:
-            lines.append(f"{text}: {listed(self.joints, self.units, sizes)}")
-        return "\n".join(lines)
+        lines = [f"replay by MuJoCo, {how}: RMS from the log, by joint", aligned(rows), ""]
+        return "\n".join([*lines, lacks_table("single causes", self.joints, self.units, self.costs)])
 
 
 def replay_export(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.export.exported import ExportedFile
-from jaxid.export.followed import Followed, listed, rms
+from jaxid.export.followed import Followed, lacks_table, rms
 from jaxid.export.replayed import mujoco_robot
 from jaxid.results.aligned import aligned
 
@@ -55,12 +55,9 @@ class ServoReplay:
             self._table(apart),
         ]
         if self.lacks:
-            lines += [
-                "",
-                "what single things move a joint, on the log where it is most, RMS",
-            ]
-        for what, sizes in self.lacks.items():
-            lines.append(f"{what}: {listed(self.joints, self.units, np.nanmax(sizes, axis=0))}")
+            worst = ((what, np.nanmax(sizes, axis=0)) for what, sizes in self.lacks.items())
+            table = lacks_table("single causes", self.joints, self.units, worst)
+            lines += ["", "what single causes move, on the log where each moves a joint most, RMS", table]
         return "\n".join(lines)
 
     def _table(self, rows: Sequence[Sequence[str]]) -> str:
