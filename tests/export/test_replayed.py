@@ -132,7 +132,7 @@ def test_servos_of_the_file_close_the_loop(tmp_path):
     # What an actuator of MuJoCo cannot hold is all that both then differ by.
     lacking = copy.deepcopy(result)
     dead = {"kind": "dead_band", "joint": 1, "joint_name": "a", "name": "dead_band[1]"}
-    lacking["model"]["effects"].append(dead | {"parameters": {"width": 0.02}})
+    lacking["model"]["effects"].append(dead | {"parameters": {"width": 0.1}})
     replayed = check_export(lacking, "mjcf", export(lacking, "mjcf"), tmp_path / "log.csv")
     [(what, cost), *_] = replayed.costs
     assert what.startswith("without dead_band[a]")
