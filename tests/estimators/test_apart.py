@@ -53,6 +53,32 @@ def test_a_joint_with_its_load_moves_as_mujoco_moves_it(folder):
         assert simulation_of_log(bare, part.log).rms[0] > 10 * off
 
 
+@pytest.fixture(scope="module")
+def geared(folder):
+    """A log whose first joint rubs more under load: MuJoCo's friction follows the force of the servo."""
+    holding = 'frictionloss="0.3" solreffriction="0.0005 1" solimpfriction="0.9999 0.9999"'
+    content = text(SERVOS, kp=60, mass=TRUE["mass"], rub=holding)
+    write_csv(folder / "geared.csv", logged(content, seconds=4.0, gear=(0.1, 0.0)))
+    return folder / "geared.csv"
+
+
+def geared_case(folder, coefficient, unknown=UNKNOWN, file="robot.xml"):
+    effect = {"kind": "load_friction", "joint": 1, "coefficient": coefficient}
+    plant = {"kind": "tree", "mjcf": str(folder / file), "unknown": unknown}
+    return {"plant": plant, "effects": [effect], "log": COLUMNS}
+
+
+def test_friction_of_a_gear_knows_the_force_of_the_links(folder, geared):
+    off = {}
+    for coefficient in (0.1, 0.0):
+        session = open_session(geared_case(folder, coefficient, file="true.xml"), str(geared))
+        assert stands_apart(session.machine, parts_of(session))
+        first = joints_alone(session.machine, parts_of(session))[0]
+        off[coefficient] = simulation_of_log(first.parts[0].machine, first.parts[0].log).rms[0]
+    assert off[0.1] < 1e-3
+    assert off[0.0] > 10 * off[0.1]
+
+
 def test_the_start_is_near_although_the_file_is_far_off(folder):
     session = session_of(folder)
     first, second = joints_alone(session.machine, parts_of(session))
@@ -85,6 +111,15 @@ def test_only_an_arm_of_servos_without_unknown_links_stands_apart(folder):
 def _opened(folder, unknown):
     session = session_of(folder, unknown=unknown)
     return session.machine, parts_of(session)
+
+
+@pytest.mark.slow
+def test_friction_of_a_gear_is_found_from_commands_and_positions(folder, geared):
+    unknown = [word for word in UNKNOWN if word != "damping"]
+    result = identify(geared_case(folder, {"guess": 0.05}, unknown), str(geared))
+    assert result.converged
+    assert result.parameters["load_friction[1].coefficient"].value == pytest.approx(0.1, rel=0.05)
+    assert result.parameters["coulomb_friction[1].level"].value == pytest.approx(0.3, rel=0.05)
 
 
 @pytest.mark.slow

@@ -36,11 +36,15 @@ def text(drives=MOTORS, mass=1.0, rub=STIFF, **values):
 TRUE = {"mass": 1.4, "rub": f'frictionloss="0.3" {STIFF}'}
 
 
-def logged(content, seconds=2.0):
-    """Columns of a log by MuJoCo: commands are sums of sines, torques or references."""
+def logged(content, seconds=2.0, gear=(0.0, 0.0)):
+    """Columns of a log by MuJoCo: commands are sums of sines, torques or references.
+
+    `gear` is the friction of each joint in proportion to the torque of its drive, which no MJCF holds.
+    """
     model = mujoco.MjModel.from_xml_string(content)
     data, rng = mujoco.MjData(model), np.random.default_rng(1)
     inner, count = round(1 / RATE / model.opt.timestep), round(seconds * RATE)
+    level = model.dof_frictionloss.copy()
     t = np.arange(count) / RATE
     waves = [np.sin(2 * np.pi * f * t) for f in (0.7, 1.9)]
     ctrl = 0.4 * np.stack([waves[0] + waves[1], waves[1] - waves[0]], axis=1) * [2.0, 1.0]
@@ -49,7 +53,10 @@ def logged(content, seconds=2.0):
         q[k], data.ctrl[:] = data.qpos, ctrl[k]
         mujoco.mj_forward(model, data)
         u[k] = data.qfrc_actuator
-        mujoco.mj_step(model, data, inner)
+        for _ in range(inner):
+            # The torque is that of the last step, 0.25 ms late.
+            model.dof_frictionloss[:] = level + np.array(gear) * np.abs(data.qfrc_actuator)
+            mujoco.mj_step(model, data)
     q += 1e-6 * rng.normal(size=q.shape)
     columns = {"t": t, "qa": q[:, 0], "qb": q[:, 1], "ra": ctrl[:, 0], "rb": ctrl[:, 1]}
     return columns | {"ua": u[:, 0], "ub": u[:, 1]}

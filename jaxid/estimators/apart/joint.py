@@ -19,10 +19,13 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.controllers import Controller
 from jaxid.controllers.linear import PD, CascadePD
+from jaxid.effects.friction import LoadFriction
+from jaxid.estimators.apart.gear import GearFriction
 from jaxid.estimators.several.parts import Part
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
+from jaxid.model.effect import Effect
 from jaxid.model.unknowns import CONTROLLER, Free, Parameters
 from jaxid.numerics.kept import kept_jit
 from jaxid.plants.axis import Axis
@@ -89,8 +92,9 @@ def stands_apart(machine: Machine, parts: Sequence[Part]) -> bool:
         return False
     if len(plant.driven(plant.joints)) < plant.joints or plant.shafts or machine.parameters.bodies:
         return False
-    # A load would pass through an effect in the drive, or an effect that reads the force of the drive.
-    if any((e.in_drive or e.needs_drive) and e.controller_field is None for e in plant.effects):
+    # The links' forces would pass through an effect in the drive; only a gear's friction knows them.
+    through = [e for e in plant.effects if (e.in_drive or e.needs_drive) and e.controller_field is None]
+    if not all(type(e) is LoadFriction for e in through):
         return False
     if any(_joint_of(f, machine) is None or f.log is not None for f in machine.parameters.free):
         return False
@@ -124,10 +128,10 @@ def joints_alone(machine: Machine, parts: Sequence[Part]) -> list[JointAlone]:
         for part, load in zip(parts, loads, strict=True):
             # The force of the links beyond that of the constant inertia of the axis.
             beside = means[joint] * part.data.qdd[:, joint] - load[:, joint]
-            one = _machine(part.machine, joint, means[joint], beside)
+            one = _machine(part.machine, joint, means[joint], beside, part.log.period)
             index = np.array([own.index(name) for name in one.parameters.names], dtype=int)
             alone.append(Part(part.name, _log(part, joint), one, index, _prepared(part.data, joint)))
-        whole = _machine(machine, joint, means[joint], alone[0].machine.load)
+        whole = _machine(machine, joint, means[joint], alone[0].machine.load, alone[0].log.period)
         index = np.array([names.index(name) for name in own])
         ratio = float(_ratios(machine.plant)[joint])
         out.append(JointAlone(joint, whole, tuple(alone), index, float(means[joint]), ratio))
@@ -168,7 +172,7 @@ def _of_links(plant: LinkTree, q: Array, qd: Array, qdd: Array) -> tuple[Array, 
     return jax.vmap(plant.inertial)(q, qd, qdd), jax.lax.map(own, q[::every])
 
 
-def _machine(machine: Machine, joint: int, links: float, load: Any) -> Machine:
+def _machine(machine: Machine, joint: int, links: float, load: Any, period: float) -> Machine:
     """Return the machine of a joint, with its unknowns, whose links have a constant inertia."""
     plant, law = machine.plant, machine.controller
     assert isinstance(plant, LinkTree), "checked by stands_apart"
@@ -178,7 +182,13 @@ def _machine(machine: Machine, joint: int, links: float, load: Any) -> Machine:
     rotor = 0.0 if rotors is None else ratio * float(np.asarray(rotors)[joint])
 
     numbers = [k for k, e in enumerate(plant.effects) if e.port == joint]
-    effects = tuple(replace(plant.effects[k], port=0) for k in numbers)
+    effects: tuple[Effect, ...] = tuple(replace(plant.effects[k], port=0) for k in numbers)
+    if load is not None:
+        beside = np.ravel(load)
+        effects = tuple(
+            GearFriction.of(e, beside, period, law.period) if isinstance(e, LoadFriction) else e
+            for e in effects
+        )
     scale = plant.smoothing.velocity_scale
     smoothing = replace(plant.smoothing, velocity_scale=scale if np.ndim(scale) == 0 else scale[joint])
     free = [
