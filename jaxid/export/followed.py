@@ -74,16 +74,22 @@ class Followed:
     def lacks(self, model: Mapping[str, Any], exported: ExportedFile) -> Iterator[tuple[str, np.ndarray]]:
         """Return what a file cannot hold of a result, and what each thing moves: a sentence and RMS by joint.
 
+        Effects of one kind are taken out together.
+
         Args:
             model: `model` of result.json.
             exported: The file.
         """
-        for number in exported.lost:
+        effects = model["effects"]
+        for kind in dict.fromkeys(effects[number]["kind"] for number in exported.lost):
+            alike = [number for number in exported.lost if effects[number]["kind"] == kind]
             try:
-                changed = _simulated(without_effects(self.machine, {number}), self.log)[1]
+                changed = _simulated(without_effects(self.machine, set(alike)), self.log)[1]
             except InputError:
                 continue
-            yield f"without {shown(model['effects'][number])}", rms(changed - self.own)
+            several = f"{kind} of {len(alike)} joints"
+            what = shown(effects[alike[0]]) if len(alike) == 1 else several
+            yield f"without {what}", rms(changed - self.own)
         for name in exported.added:
             stiff = self.robot.motion(self.replay, Setting(locked=(name,)))
             yield f"without the second joint '{name}'", rms(stiff - self.after)
