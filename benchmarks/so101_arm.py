@@ -3,7 +3,8 @@
     JAXID_DATA=FOLDER python -m benchmarks.so101_arm [-o DIR]
 
 Runs `jaxid identify so101.xml MOTION... --validate MOTION... -o out` in a fresh process, on the files as they
-are. What the command prints of MuJoCo's replay stands in DIR/so101_arm.md, with the time that it took.
+are. What the command prints of MuJoCo's replay stands in DIR/so101_arm.md, with the time that it took. Then the
+same case is fitted with what an MJCF does not hold, and `jaxid export --check` says what that moves.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
@@ -25,6 +27,9 @@ FITTED = ("multisine", "friction_gravity", "prbs_excitation")
 # The motions that `benchmarks.so101` leaves out as well.
 LEFT_OUT = ("backlash_detection", "single_joint_rotation", "slow_precision")
 LEFT_OUT += ("step_response", "trapezoidal_profile", "wave_motion")
+# A fitted motion and one that was left out, on which single effects are taken out.
+CHECKED = ("multisine", "step_response")
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 
 
 def main() -> int:
@@ -40,40 +45,137 @@ def main() -> int:
 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out"
-        command = [sys.executable, "-m", "jaxid.cli", "identify", str(data / "so101.xml")]
-        command += [str(data / f"{name}.csv") for name in FITTED]
+        command = ["identify", str(data / "so101.xml"), *(str(data / f"{name}.csv") for name in FITTED)]
         for name in LEFT_OUT:
             command += ["--validate", str(data / f"{name}.csv")]
-        begin, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-        done = subprocess.run([*command, "-o", str(out)], capture_output=True, text=True, check=False)
-        seconds = time.perf_counter() - begin
-        cpu = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+        plain = Ran.of([*command, "-o", str(out)])
         if not (out / "result.json").exists():
-            print(done.stderr, file=sys.stderr)
+            print(plain.error, file=sys.stderr)
             return 1
-        result = json.loads((out / "result.json").read_text())
+        first = json.loads((out / "result.json").read_text())
+        case = (out / "first_case.toml").read_text() + "".join(map(_effects, range(1, 7)))
+        (out / "more.toml").write_text(case)
+        command[1], more = str(out / "more.toml"), Path(folder) / "more"
+        fuller = Ran.of([*command, "-o", str(more)])
+        if not (more / "result.json").exists():
+            print(fuller.error, file=sys.stderr)
+            return 1
+        second = json.loads((more / "result.json").read_text())
+        export = [
+            "export",
+            str(more / "result.json"),
+            "--to",
+            "mjcf",
+            "-o",
+            str(more / "found.xml"),
+            "--force",
+        ]
+        checked = {name: Ran.of([*export, "--check", str(data / f"{name}.csv")]).text for name in CHECKED}
 
-    replay = done.stdout[done.stdout.index("replay by MuJoCo") :].split("\n\n")[0].rstrip()
-    own = [1e3 * x for x in result["gap"]["simulation"]["validation"]]
+    replay = plain.text[plain.text.index("replay by MuJoCo") :].rstrip()
     shown = f"jaxid identify so101.xml {' '.join(f'{n}.csv' for n in FITTED)} --validate ... -o out"
     lines = [
         "# SO-101 by one command",
         "",
         f"Written by `python -m benchmarks.so101_arm` on {date.today()}, at {commit_of(ROOT)}.",
-        f"`{shown}` took {seconds:.0f} s, {cpu:.0f} s of a processor.",
-        f"It ended with status {done.returncode}; converged: {str(result['converged']).lower()}.",
+        f"`{shown}` took {plain.wall:.0f} s, {plain.cpu:.0f} s of a processor.",
+        f"It ended with status {plain.status}; converged: {str(first['converged']).lower()}.",
         f"Left out of the fit: {', '.join(LEFT_OUT)}.",
         "",
         "```",
         replay,
         "```",
         "",
-        "jaxid's own simulation of the arm is off on the motions left out, in the worst of them, by joint:",
-        f"{', '.join(f'{x:.2g}' for x in own)} mrad.",
+        "jaxid's own simulation of the arm is off the motions, by joint, in mrad:",
+        "",
+        *_gaps(first),
+        "",
+        "## What an MJCF does not hold",
+        "",
+        "The same case with a dead band and a friction in proportion to the load at every joint, all twelve unknown:",
+        f"{fuller.wall:.0f} s, {fuller.cpu:.0f} s of a processor; converged: {str(second['converged']).lower()}.",
+        "",
+        "| effect | " + " | ".join(JOINTS) + " |",
+        "|---" * 7 + "|",
+        *(_row(second, what) for what in ("dead_band width rad", "load_friction coefficient -")),
+        "",
+        "jaxid's own simulation of the arm is then off the motions, by joint, in mrad:",
+        "",
+        *_gaps(second),
+        "",
+        "What each thing moves, by `jaxid export --check`; the file with this result lacks dead band and friction",
+        "by load, so it is farther off than the one above, whose friction was fitted without them:",
     ]
+    for name, text in checked.items():
+        table = text[text.index("replay by MuJoCo") :].rstrip()
+        lines += ["", f"{name}:", "", "```", table, "```"]
     (options.o / "so101_arm.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))
     return 0
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A command of jaxid that ran in a fresh process.
+
+    Args:
+        text: What it printed; error: what it printed of errors.
+        status: Its exit status.
+        wall: Time by the clock [s].
+        cpu: Time of a processor [s].
+    """
+
+    text: str
+    error: str
+    status: int
+    wall: float
+    cpu: float
+
+    @classmethod
+    def of(cls, arguments: list[str]) -> "Ran":
+        """Run a command."""
+        begin, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+        command = [sys.executable, "-m", "jaxid.cli", *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        wall = time.perf_counter() - begin
+        cpu = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+        return cls(done.stdout, done.stderr, done.returncode, wall, cpu)
+
+
+def _effects(joint: int) -> str:
+    """Return the tables of a case for what a servo has and an MJCF lacks."""
+    return f"""
+[[effects]]
+kind = "dead_band"
+joint = {joint}
+width = {{ guess = 0.005 }}
+
+[[effects]]
+kind = "load_friction"
+joint = {joint}
+coefficient = {{ guess = 0.1 }}
+"""
+
+
+def _gaps(result: dict) -> list[str]:
+    """Return a table of the gaps of all logs in jaxid's own simulation."""
+    rows = ["| motion | " + " | ".join(JOINTS) + " |", "|---" * 7 + "|"]
+    for name, gap in {**result["gap"]["fits"], **result["gap"]["validations"]}.items():
+        rows.append(f"| {name} | " + " | ".join(f"{1e3 * x:.3g}" for x in gap["simulation"]) + " |")
+    return rows
+
+
+def _row(result: dict, what: str) -> str:
+    """Return an effect's values and their deviations by joint."""
+    kind, name, unit = what.split()
+    cells = []
+    for joint in range(1, 7):
+        found = result["parameters"][f"{kind}[{joint}].{name}"]
+        if found["value"] is None:
+            cells.append("not identifiable")
+        else:
+            cells.append(f"{found['value']:.3g} ({found['std']:.2g})")
+    return f"| {kind} [{unit}] | " + " | ".join(cells) + " |"
 
 
 if __name__ == "__main__":
