@@ -3,8 +3,8 @@
     JAXID_DATA=FOLDER python -m benchmarks.so101_arm [-o DIR]
 
 Runs `jaxid identify so101.xml MOTION... --validate MOTION... -o out` in a fresh process, on the files as they
-are. What the command prints of MuJoCo's replay stands in DIR/so101_arm.md, with the time that it took. Then the
-same case is fitted with what an MJCF does not hold, and `jaxid export --check` says what that moves.
+are. What the command prints of MuJoCo's replay stands in DIR/so101_arm.md, with the time that it took. Then
+the same case is fitted with what an MJCF does not hold, and `jaxid export --check` says what that moves.
 """
 
 import argparse
@@ -79,7 +79,7 @@ def main() -> int:
         "",
         f"Written by `python -m benchmarks.so101_arm` on {date.today()}, at {commit_of(ROOT)}.",
         f"`{shown}` took {plain.wall:.0f} s, {plain.cpu:.0f} s of a processor.",
-        f"It ended with status {plain.status}; converged: {str(first['converged']).lower()}.",
+        f"It ended with status {plain.status}; converged: {_yes(first['converged'])}.",
         f"Left out of the fit: {', '.join(LEFT_OUT)}.",
         "",
         "```",
@@ -92,8 +92,8 @@ def main() -> int:
         "",
         "## What an MJCF does not hold",
         "",
-        "The same case with a dead band and a friction in proportion to the load at every joint, all twelve unknown:",
-        f"{fuller.wall:.0f} s, {fuller.cpu:.0f} s of a processor; converged: {str(second['converged']).lower()}.",
+        "The same case with a dead band and friction in proportion to the load at every joint, all unknown:",
+        f"{fuller.wall:.0f} s, {fuller.cpu:.0f} s of a processor; converged: {_yes(second['converged'])}.",
         "",
         "| effect | " + " | ".join(JOINTS) + " |",
         "|---" * 7 + "|",
@@ -103,8 +103,8 @@ def main() -> int:
         "",
         *_gaps(second),
         "",
-        "What each thing moves, by `jaxid export --check`; the file with this result lacks dead band and friction",
-        "by load, so it is farther off than the one above, whose friction was fitted without them:",
+        "What each thing moves, by `jaxid export --check`. The file with this result lacks the dead bands",
+        "and the friction by load; the friction of the file above was fitted without them, and stands for them.",
     ]
     for name, text in checked.items():
         table = text[text.index("replay by MuJoCo") :].rstrip()
@@ -140,6 +140,10 @@ class Ran:
         wall = time.perf_counter() - begin
         cpu = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
         return cls(done.stdout, done.stderr, done.returncode, wall, cpu)
+
+
+def _yes(flag: bool) -> str:
+    return str(flag).lower()
 
 
 def _effects(joint: int) -> str:
