@@ -3,8 +3,8 @@
     JAXID_DATA=FOLDER python -m benchmarks.so101_arm [-o DIR]
 
 Runs `jaxid identify so101.xml MOTION... --validate MOTION... -o out` in a fresh process, on the files as they
-are. What the command prints of MuJoCo's replay stands in DIR/so101_arm.md, with the time that it took. Then
-the same case is fitted with what an MJCF does not hold, and `jaxid export --check` says what that moves.
+are. What the command prints of MuJoCo's replay stands in DIR/so101_arm.md, with the time that it took.
+Then the same case is fitted with what an MJCF does not hold, and `jaxid export --check` says what that moves.
 """
 
 import argparse
@@ -92,7 +92,7 @@ def main() -> int:
         "",
         "## What an MJCF does not hold",
         "",
-        "The same case with a dead band and friction in proportion to the load at every joint, all unknown:",
+        "The same case, dead bands and friction in proportion to the load unknown at every joint:",
         f"{fuller.wall:.0f} s, {fuller.cpu:.0f} s of a processor; converged: {_yes(second['converged'])}.",
         "",
         "| effect | " + " | ".join(JOINTS) + " |",
@@ -103,8 +103,9 @@ def main() -> int:
         "",
         *_gaps(second),
         "",
-        "What each thing moves, by `jaxid export --check`. The file with this result lacks the dead bands",
-        "and the friction by load; the friction of the file above was fitted without them, and stands for them.",
+        "What each thing moves, by `jaxid export --check`. The file of this result lacks dead bands",
+        "and the friction by load; the friction of the file above was fitted without them, and stands in for",
+        "them.",
     ]
     for name, text in checked.items():
         table = text[text.index("replay by MuJoCo") :].rstrip()
