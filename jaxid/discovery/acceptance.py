@@ -78,6 +78,11 @@ class Acceptance:
         """Part of the samples that a filter leaves independent of each other."""
         return self.data.recipe.independent
 
+    @property
+    def noise(self) -> float:
+        """Sum of squares of the noise."""
+        return self._noise
+
     def residual(self, theta: np.ndarray) -> Float[np.ndarray, "kept n"]:
         """Return the force residual of a model on the fitted log."""
         return self.domain.evaluate(self.samples, theta, ())[0]

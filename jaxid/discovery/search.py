@@ -146,6 +146,10 @@ class Search:
         """Draw residuals by simulated noise; None: surrogates have the residual with other signs."""
         return None
 
+    def widened(self, model: Model, screened: Screen) -> Screen:
+        """Return a screen with what candidates gain far from the model; here they stay near it."""
+        return screened
+
     def rest(self, model: Model | None = None) -> list[cand.Candidate]:
         """Return the candidates that a model, by default the current one, may still get."""
         gone = [*(self.model if model is None else model).added, *self.barred]
@@ -237,7 +241,7 @@ class Search:
         if self.acceptance.at_floor(model.theta):
             return (), (), 0.0
         self.progress(f"screening {len(self.rest(model))} effects")
-        screened = screen_candidates(self, model, ahead=ahead)
+        screened = self.widened(model, screen_candidates(self, model, ahead=ahead))
 
         # A linear screen may promise far more than a refit then gains: the effect itself is the measure.
         compared = [s for s in screened.scores if replaced is None or s.candidate is replaced]
@@ -368,6 +372,10 @@ class Search:
         """Fit the active unknowns to the log, from and beside the others."""
         return cand.refine(self.superset, self.samples, theta, active, self.domain.evaluate)[0]
 
+    def fit_from(self, starts: Sequence[np.ndarray], active: np.ndarray) -> np.ndarray:
+        """Fit the active unknowns from each of several starts, and return the best fit."""
+        return min((self.fit(theta, active) for theta in starts), key=self.acceptance.squares)
+
     def step(
         self,
         model: Model,
@@ -393,13 +401,13 @@ class Search:
         """Refit a model with one more effect, or with two, and score the gain."""
         new = [s for s in (beside, score) if s is not None]
         active = self.fitted_by([*model.added, *[s.candidate for s in new]])
-        fits = []
+        starts = []
         for guesses in itertools.product(*[_starts(s) for s in new]):
             theta = model.theta.copy()
             for s, guess in zip(new, guesses, strict=True):
                 theta[s.candidate.index] = guess
-            fits.append(self.fit(theta, active))
-        theta = min(fits, key=self.acceptance.squares)
+            starts.append(theta)
+        theta = self.fit_from(starts, active)
 
         e, jacobian = self.domain.evaluate(self.samples, theta, active)
         after = screened.held_out(e, jacobian[..., active])

@@ -44,7 +44,7 @@ def coarse_starts(
         numerics: Settings of the integration of each.
         count: Number of points beside the guesses.
     """
-    points = _points(machine)
+    points = points_about(machine)
     if points is None:
         return [machine.parameters.guess]
     if len(parts) == 1:
@@ -63,8 +63,8 @@ def coarse_starts(
     return list(kept[np.argsort(costs, kind="stable")[: count + 1]])
 
 
-def _points(machine: Machine) -> Float[np.ndarray, "points p"] | None:
-    """Return the guesses and the points about them; None if no unknown moves."""
+def points_about(machine: Machine, count: int = _POINTS) -> Float[np.ndarray, "points p"] | None:
+    """Return the guesses and so many points about them; None if no unknown moves."""
     unknown = machine.parameters
     guess, (lower, upper) = unknown.guess, unknown.bounds
     delays = np.array([f.path[0] == CONTROLLER and f.path[1] == "delay" for f in unknown.free])
@@ -72,8 +72,8 @@ def _points(machine: Machine) -> Float[np.ndarray, "points p"] | None:
     if not moved.any():
         return None
     names = list(dict.fromkeys(f.parameter for f, m in zip(unknown.free, moved, strict=True) if m))
-    draws = scipy.stats.qmc.Sobol(len(names), scramble=False).random(_POINTS)
-    points = np.tile(guess, (_POINTS, 1))
+    draws = scipy.stats.qmc.Sobol(len(names), scramble=False).random(count)
+    points = np.tile(guess, (count, 1))
     for k in np.flatnonzero(moved):
         own = draws[:, names.index(unknown.free[k].parameter)]
         longest = max(_SPREAD * guess[k], _LONGEST)

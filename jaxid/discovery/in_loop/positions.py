@@ -14,26 +14,22 @@ from typing import Any, ClassVar
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxid.arrays import Array
 from jaxid.discovery import candidates as cand
+from jaxid.discovery import evidence as ev
 from jaxid.discovery.acceptance import Acceptance
 from jaxid.discovery.domain import Domain
 from jaxid.discovery.final import machine_with
-from jaxid.discovery.in_loop.candidates import loop_columns
+from jaxid.discovery.in_loop.model_fit import ModelFit, SimulatedLog
+from jaxid.discovery.score import Score
+from jaxid.discovery.screen import Screen
 from jaxid.discovery.search import Model, Search
-from jaxid.estimators.simulated_output import output_residual
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.model.plant import Plant
-from jaxid.numerics.kept import kept_jit
-from jaxid.numerics.lanes import in_threads
 from jaxid.session import OpenedLog
 from jaxid.simulation.noisy_loop import ReadingNoise, drawn_readings, estimated_noise
 from jaxid.simulation.replay import Numerics, Replay, make_replay
 from jaxid.simulation.step_size import fastest_rate
 
-# Number of directions in which the loop is differentiated at once.
-_COLUMNS = 4
 # Least steps of integration a tick with effects that put inertia behind a spring, and the largest product of
 # a step and the spring's frequency [rad] that is followed.
 _SPRUNG, _TURN = 4, 0.25
@@ -41,6 +37,9 @@ _SPRUNG, _TURN = 4, 0.25
 _RENEWALS = 2
 # Delays beside that of a fit from which it is tried again, in rows of the log.
 _DELAYS = (-1.0, -0.5, -0.25, 0.25, 0.5, 1.0)
+# Squared residual, relative to the noise's, beyond which candidates are fitted from afar too; factors on the
+# strength of those of either sign; number of fits of each, and of those that begin at different starts.
+_FAR, _FACTORS, _STARTS, _FEW = 1.5, (-1.0, -0.1, 0.1, 1.0), 7, 4
 # Part of the motion that integration leaves wrong in any model.
 NUMERICS = 1e-5
 
@@ -55,7 +54,6 @@ class LoopSamples:
             hundreds of runs, which the superset would make slow.
         view: The unknowns of the superset as this log has them; None: it is the only one.
         quiet: The simulation without noise: without effects that add a spring, and with them.
-        calm, sprung: The same, shifted to the mean readings of a loop with noise, if that is known.
         moving: Mask of the samples that count: all of joints with an encoder.
         weight: The same as numbers.
         noise: The noise of the encoder; None before it is estimated.
@@ -65,8 +63,6 @@ class LoopSamples:
     machine: Machine
     view: cand.View | None
     quiet: tuple[Replay, Replay]
-    calm: Replay
-    sprung: Replay
     moving: Bool[np.ndarray, "time n"]
     weight: Float[np.ndarray, "time n"]
     noise: ReadingNoise | None = None
@@ -103,16 +99,34 @@ class LoopSamples:
         log, mine = run.log, superset if view is None else view.superset(superset)
         moving = np.tile(np.array(log.measured), (log.samples, 1))
         finer = replace(numerics, substeps=max(_SPRUNG, numerics.substeps))
-        calm, sprung = (make_replay(run.machine(mine.machine), log, n) for n in (numerics, finer))
-        replays = ((calm, sprung), calm, sprung)
-        return cls(log, run.machine(machine), view, *replays, moving, moving.astype(float))
+        own = run.machine(mine.machine)
+        quiet = make_replay(own, log, numerics), make_replay(own, log, finer)
+        return cls(log, run.machine(machine), view, quiet, moving, moving.astype(float))
 
     def with_noise(self, noise: ReadingNoise | None) -> LoopSamples:
         """Return the samples whose loops are shifted to the mean readings with a noise of the encoder."""
-        if noise is None:
-            return self
-        calm, sprung = (noise.on(replay) for replay in self.quiet)
-        return replace(self, calm=calm, sprung=sprung, noise=noise)
+        return self if noise is None else replace(self, noise=noise)
+
+    def simulated(self, superset: cand.CandidateModel, acting: Sequence[cand.Candidate]) -> SimulatedLog:
+        """Return the loop of a model along this log, shifted to its mean readings if its noise is known.
+
+        Args:
+            superset: The machine with all candidates.
+            acting: Effects of the model.
+        """
+        machine, replay = self._alone(superset, acting, superset.neutral)
+        names = superset.machine.parameters.names
+        base = [names.index(name) for name in self.machine.parameters.names]
+        scale = 1.0 if self.view is None else self.view.scale
+        return SimulatedLog(
+            replay=replay if self.noise is None else self.noise.on(replay),
+            plant=machine.plant,
+            places=machine.parameters.places,
+            index=np.concatenate([base, *[c.index for c in acting]]).astype(int),
+            view=self.view,
+            measured=self.measured,
+            weight=self.weight * scale,
+        )
 
     def renewed(
         self, superset: cand.CandidateModel, added: Sequence[cand.Candidate], theta: np.ndarray
@@ -176,8 +190,9 @@ class JoinedLoops:
         moving = [part.moving.copy() for part in parts]
         for mask in moving[1:]:
             mask[0] = False
+        weighted = (replace(p, weight=m.astype(float)) for p, m in zip(parts, moving, strict=True))
         joined = np.concatenate(moving)
-        return cls(tuple(parts), joined, joined.astype(float))
+        return cls(tuple(weighted), joined, joined.astype(float))
 
     def with_parts(self, parts: Sequence[LoopSamples]) -> JoinedLoops:
         """Return the same logs with other simulations."""
@@ -192,20 +207,17 @@ class PositionDomain:
     """Measured positions against those of the simulated loop.
 
     Args:
-        superset: Machine with all candidates, those that add a spring last.
-        springs: Number of effects at the end of the plant that add a spring.
+        superset: Machine with all candidates.
         step: Step of integration with springs [s].
     """
 
     superset: cand.CandidateModel
-    springs: int
     step: float
 
     @classmethod
     def of(cls, superset: cand.CandidateModel, period: float, numerics: Numerics) -> PositionDomain:
         """Return the domain of a superset, for a loop with a period [s] and these settings."""
-        springs = sum(cand.effect_of(superset, c).adds_spring for c in superset.candidates)
-        return cls(superset, springs, period / max(_SPRUNG, numerics.substeps))
+        return cls(superset, period / max(_SPRUNG, numerics.substeps))
 
     def noisier(self, samples: Loops, theta: np.ndarray) -> np.ndarray:
         """Refuse: the loop's reference has no noise, so that no search asks for this."""
@@ -218,82 +230,40 @@ class PositionDomain:
 
         Those of several logs follow each other, on the scale of their views.
         """
-        found = []
-        for part in samples.parts:
-            view = part.view
-            if view is None:
-                found.append(self._evaluate(part, theta, wanted))
-                continue
-            asked = None if wanted is None else view.wanted(wanted)
-            e, jacobian = self._evaluate(part, view.theta(theta), asked)
-            found.append((e * view.scale, view.jacobian(jacobian)))
-        if len(found) == 1:
-            return found[0]
-        return np.concatenate([e for e, _ in found]), np.concatenate([j for _, j in found])
-
-    def _evaluate(
-        self, samples: LoopSamples, theta: np.ndarray, wanted: Sequence[int] | np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute residual and derivatives of one log, at unknowns as they hold in it."""
         ask = np.arange(len(theta)) if wanted is None else np.unique(np.asarray(wanted, int))
-        replay, plant, places = self._simulated(samples, theta, ask)
-        known = theta[: len(places)]
-        problem = (replay, places, plant, samples.measured, samples.weight)
-        jacobian = np.zeros((*samples.measured.shape, len(theta)))
-        if not len(ask):
-            return np.asarray(_only_residual(*problem, known)), jacobian
+        model = self.model(samples, self.acting(theta, ask))
+        (e,), (columns,) = model.linearised(theta[None], ask)
+        jacobian = np.zeros((len(e), len(theta)))
+        jacobian[:, ask] = columns
+        joints = samples.moving.shape[1]
+        return e.reshape(-1, joints), jacobian.reshape(-1, joints, len(theta))
 
-        calls = []
-        for k in range(0, len(ask), _COLUMNS):
-            part = ask[k : k + _COLUMNS]
-            directions = np.zeros((len(places), _COLUMNS))
-            directions[part, np.arange(len(part))] = 1.0
-            calls.append((*problem, "position", known, directions))
-        results = in_threads(loop_columns, calls)
-        columns = np.concatenate([np.asarray(c) for _, c in results], axis=1)[:, : len(ask)]
-        jacobian[..., ask] = columns.reshape(*samples.measured.shape, -1)
-        return np.asarray(results[0][0]).reshape(samples.measured.shape), jacobian
+    def acting(self, theta: np.ndarray, ask: np.ndarray) -> tuple[cand.Candidate, ...]:
+        """Return the effects that are not neutral at some values, or whose unknowns are asked for."""
+        acts = theta != self.superset.neutral
+        acts[ask] = True
+        return tuple(c for c in self.superset.candidates if acts[c.index].any())
 
-    def _simulated(
-        self, samples: LoopSamples, theta: np.ndarray, ask: np.ndarray
-    ) -> tuple[Replay, Plant, tuple]:
-        """Return the simulation with plant and unknowns, without springs if none of them acts."""
-        superset = self.superset if samples.view is None else samples.view.superset(self.superset)
-        places, plant = superset.machine.parameters.places, superset.machine.plant
-        if not self.springs:
-            return samples.calm, plant, places
-        of_springs = np.concatenate([c.index for c in self.superset.candidates[-self.springs :]])
-        neutral = self.superset.neutral
-        if np.isin(of_springs, ask).any() or np.any(theta[of_springs] != neutral[of_springs]):
-            return samples.sprung, plant, places
-        calm = replace(plant, effects=plant.effects[: -self.springs])
-        return samples.calm, calm, places[: of_springs[0]]
+    def model(self, samples: Loops, acting: Sequence[cand.Candidate]) -> ModelFit:
+        """Return a model with its effects only, to be fitted to logs."""
+        return ModelFit(self.superset, tuple(part.simulated(self.superset, acting) for part in samples.parts))
 
     def points(
         self, rest: list[cand.Candidate], samples: Loops, theta: np.ndarray, residual: np.ndarray
     ) -> list[cand.Point]:
         """Linearise candidates at each of their starts, beside a model."""
-        out = []
-        faint = [c for c in rest if c.amplitude.any() and not self._spring(c)]
-        for k in range(max((len(c.starts) for c in faint), default=0)):
-            # Faint forces leave the motion as it is, and share an evaluation.
-            now = [c for c in faint if k < len(c.starts)]
-            at = theta.copy()
-            for c in now:
-                at[c.index] = c.probe(k)
-            _, jacobian = self.evaluate(samples, at, np.concatenate([c.index for c in now]))
-            out += [cand.Point(c, k, np.zeros_like(residual), jacobian[..., c.index]) for c in now]
+        joints, out = samples.moving.shape[1], []
         for c in rest:
-            if any(c is f for f in faint):
+            starts = [k for k in range(len(c.starts)) if not self._spring(c) or self._followed(c, k, samples)]
+            if not starts:
                 continue
-            for k in range(len(c.starts)):
-                if self._spring(c) and not self._followed(c, k, samples):
-                    continue
-                at = theta.copy()
-                at[c.index] = c.probe(k)
-                e, jacobian = self.evaluate(samples, at, c.index)
-                shift = np.zeros_like(e) if c.amplitude.any() else e - residual
-                out.append(cand.Point(c, k, shift, jacobian[..., c.index]))
+            at = np.tile(theta, (len(starts), 1))
+            at[:, c.index] = [c.probe(k) for k in starts]
+            model = self.model(samples, self.acting(theta, c.index))
+            for k, e, columns in zip(starts, *model.linearised(at, c.index), strict=True):
+                # Faint forces leave the motion as it is.
+                shift = np.zeros_like(residual) if c.amplitude.any() else e.reshape(-1, joints) - residual
+                out.append(cand.Point(c, k, shift, columns.reshape(-1, joints, len(c.index))))
         return [p for p in out if np.all(np.isfinite(p.columns)) and np.all(np.isfinite(p.offset))]
 
     def _spring(self, c: cand.Candidate) -> bool:
@@ -305,13 +275,6 @@ class PositionDomain:
         alone = replace(self.superset.machine.plant, effects=(effect,))
         still = np.zeros((1, len(self.superset.machine.gain)))
         return float(fastest_rate(alone, samples.parts[0].measured[:1], still)) * self.step < _TURN
-
-
-@kept_jit
-def _only_residual(
-    replay: Replay, places: tuple, plant: Plant, measured: Array, weight: Array, theta: Array
-) -> Array:
-    return output_residual(replay, places, plant, measured, weight)(theta)
 
 
 @dataclass
@@ -361,25 +324,94 @@ class LoopSearch(Search):
         positions, logs: Those of `LoopAcceptance`.
         coarse: Function of a model that returns values of its unknowns from which fits start, beside those
             of the model: an incomplete model fits best in another valley than a complete one.
+        far: Function of effects and all unknowns that returns points with these effects, far from a fit.
+        scaled: Function that returns the starts of each candidate at scales near the guesses, by kind and port.
     """
 
     positions: PositionDomain | None = None
     logs: tuple[Loops, ...] = ()
     coarse: Callable[[Model], list[np.ndarray]] = lambda model: []
+    far: Callable[[Sequence[cand.Candidate], np.ndarray], np.ndarray] = lambda added, theta: theta[None]
+    scaled: Callable[[], dict[tuple[str, int], np.ndarray]] = dict
+    _fits: dict[frozenset[int], np.ndarray] = field(default_factory=dict)
 
     def _acceptance(self) -> Acceptance:
         shared = (self.superset, self.data, self.validation, self.floor, self.colour)
         return LoopAcceptance(*shared, positions=self.positions, logs=self.logs)
 
+    def fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """Fit the active unknowns to the log, from and beside the others, and from earlier fits of them."""
+        return self.fit_from([theta], active)
+
+    def fit_from(self, starts: Sequence[np.ndarray], active: np.ndarray) -> np.ndarray:
+        """Fit the active unknowns from each of several starts and earlier fits, and return the best fit."""
+        assert self.positions is not None, "given by the search"
+        if not len(active):
+            return min(starts, key=self.acceptance.squares)
+        key = frozenset(active.tolist())
+        earlier = [self._fits[key]] if key in self._fits else []
+        acting = self.positions.acting(starts[0], active)
+        ends, squares = self.positions.model(self.samples, acting).fit(np.array([*starts, *earlier]), active)
+        best = ends[int(np.argmin(squares))]
+        self._fits[key] = best
+        return best
+
+    def widened(self, model: Model, screened: Screen) -> Screen:
+        """Return a screen with what candidates gain at fits that begin far from an incomplete model.
+
+        Much that is missing draws the unknowns of the model far away, to where no candidate helps by itself.
+        Only a model that leaves more than the noise is searched for that.
+        """
+        if self.acceptance.squares(model.theta) < _FAR * self.acceptance.noise:
+            return screened
+        scores = {id(s.candidate): s for s in screened.scores}
+        for c in self.rest(model):
+            self.progress(f"fitting with {c.label} from afar")
+            active = self.fitted_by((*model.added, c))
+            theta = self.fit_from(self._afar(model, c, active), active)
+            e, jacobian = self.domain.evaluate(self.samples, theta, active)
+            if not (np.all(np.isfinite(e)) and np.all(np.isfinite(jacobian))):
+                continue
+            after = screened.held_out(e, jacobian[..., active])
+            gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
+            known = scores.get(id(c))
+            if known is None or gained > known.evidence:
+                scores[id(c)] = Score(c, 0 if known is None else known.start, theta[c.index], gained)
+        return replace(screened, scores=sorted(scores.values(), key=lambda s: -s.evidence))
+
+    def _afar(self, model: Model, c: cand.Candidate, active: np.ndarray) -> list[np.ndarray]:
+        """Return starts of a model with a candidate: the best of many points in simulation."""
+        assert self.positions is not None, "given by the search"
+        added = (*model.added, c)
+        starts = [*c.starts, *self.scaled().get((c.kind, c.port), [])]
+        free = [self.superset.machine.parameters.free[k].sign == "free" for k in c.index]
+        both_ways = bool(np.any(c.amplitude & free))
+        groups = []
+        for start in starts:
+            for factor in _FACTORS if both_ways else (1.0,):
+                theta = model.theta.copy()
+                theta[c.index] = np.where(c.amplitude, factor, 1.0) * start
+                groups.append(np.concatenate([theta[None], self.far(added, theta)]))
+        points = np.concatenate(groups)
+        squares = self.positions.model(self.samples, added).squares(points)
+        # The best of each start, then the best of all.
+        group = np.repeat(np.arange(len(groups)), [len(g) for g in groups])
+        order = np.argsort(squares, kind="stable")
+        first = [order[np.flatnonzero(group[order] == k)[0]] for k in range(len(groups))]
+        first = sorted(first, key=lambda k: squares[k])[:_FEW]
+        chosen = list(dict.fromkeys([*first, *order]))[:_STARTS]
+        return [points[k] for k in chosen]
+
     def renewed(self, model: Model) -> Model:
         """Return a model refitted from many starts, with the noise of the encoder as it is beside it."""
         index = self.fitted_by(model.added)
-        fits = [model.theta]
+        starts = [model.theta]
         for values in self.coarse(model) if model.added else []:
             theta = model.theta.copy()
             theta[index] = values
-            fits.append(self.fit(theta, index))
-        model = replace(model, theta=min(fits, key=self.acceptance.squares))
+            starts.append(theta)
+        if len(starts) > 1:
+            model = replace(model, theta=self.fit_from(starts, index))
         for _ in range(_RENEWALS):
             renewed: list[Loops] = []
             for samples in self.logs:
@@ -388,28 +420,29 @@ class LoopSearch(Search):
             self.logs = tuple(renewed)
             self.samples, *others = self.logs
             self.acceptance.samples, self.acceptance.others = self.samples, others
-            theta = self.fit(model.theta, index)
-            others = self._at_other_delays(theta, index) if model.added else []
-            model = replace(model, theta=min([theta, *others], key=self.acceptance.squares))
+            model = replace(model, theta=self.fit(model.theta, index))
+            if model.added:
+                model = replace(model, theta=self._at_other_delays(model.theta, index))
         return model
 
-    def _at_other_delays(self, theta: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
-        """Return fits from other delays about that of a fit.
+    def _at_other_delays(self, theta: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Return the best fit from other delays about that of a fit.
 
         A command that is held from row to row, or has quantised readings beside it, leaves the cost several
         minima along the delay, about a row apart.
         """
+        assert self.positions is not None, "given by the search"
         free = self.superset.machine.parameters.free
         row = float(self.samples.parts[0].log.period)
-        out = []
+        model = self.positions.model(self.samples, self.positions.acting(theta, index))
+        starts = [theta]
         for k in (k for k in index if free[k].path[-1] == "delay"):
-            for step in _DELAYS:
-                if theta[k] + step * row > 0:
-                    at = theta.copy()
-                    at[k] += step * row
-                    # The others first: together with them it would return to where it came from.
-                    out.append(self.fit(self.fit(at, index[index != k]), index))
-        return out
+            moved = [theta[k] + step * row for step in _DELAYS if theta[k] + step * row > 0]
+            at = np.tile(theta, (len(moved), 1))
+            at[:, k] = moved
+            # The others first: together with them it would return to where it came from.
+            starts += list(model.fit(at, index[index != k])[0]) if len(moved) else []
+        return self.fit_from(starts, index)
 
     def drawn_noise(self, model: Model, runs: int) -> Float[np.ndarray, "runs time n"] | None:
         """Draw residuals of the fitted logs by the noise in their loops; None if it is not known of one."""
