@@ -7,6 +7,7 @@ what the fitted parameters could do in its place is projected off by the search,
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -40,6 +41,8 @@ _DELAYS = (-1.0, -0.5, -0.25, 0.25, 0.5, 1.0)
 # Squared residual, relative to the noise's, beyond which candidates are fitted from afar too; factors on the
 # strength of those of either sign; number of fits of each, and of those that begin at different starts.
 _FAR, _FACTORS, _STARTS, _FEW = 1.5, (-1.0, -0.1, 0.1, 1.0), 7, 4
+# Points from which these are chosen, of all starts of a candidate together, and at least at each.
+_AFAR, _LEAST = 1024, 16
 # Part of the motion that integration leaves wrong in any model.
 NUMERICS = 1e-5
 
@@ -324,14 +327,17 @@ class LoopSearch(Search):
         positions, logs: Those of `LoopAcceptance`.
         coarse: Function of a model that returns values of its unknowns from which fits start, beside those
             of the model: an incomplete model fits best in another valley than a complete one.
-        far: Function of effects and all unknowns that returns points with these effects, far from a fit.
-        scaled: Function that returns the starts of each candidate at scales near the guesses, by kind and port.
+        far: Function of effects, all unknowns and a count that returns so many points with these effects
+            about the guesses of the case.
+        scaled: Function that returns starts by kind and port, at the scales of a machine near the guesses.
     """
 
     positions: PositionDomain | None = None
     logs: tuple[Loops, ...] = ()
     coarse: Callable[[Model], list[np.ndarray]] = lambda model: []
-    far: Callable[[Sequence[cand.Candidate], np.ndarray], np.ndarray] = lambda added, theta: theta[None]
+    far: Callable[[Sequence[cand.Candidate], np.ndarray, int], np.ndarray] = lambda added, theta, n: theta[
+        None
+    ]
     scaled: Callable[[], dict[tuple[str, int], np.ndarray]] = dict
     _fits: dict[frozenset[int], np.ndarray] = field(default_factory=dict)
 
@@ -385,13 +391,14 @@ class LoopSearch(Search):
         added = (*model.added, c)
         starts = [*c.starts, *self.scaled().get((c.kind, c.port), [])]
         free = [self.superset.machine.parameters.free[k].sign == "free" for k in c.index]
-        both_ways = bool(np.any(c.amplitude & free))
+        factors = _FACTORS if np.any(c.amplitude & free) else (1.0,)
+        # A power of two, as sequences of low discrepancy have it.
+        count = 2 ** int(np.log2(max(_AFAR / (len(starts) * len(factors)), _LEAST)))
         groups = []
-        for start in starts:
-            for factor in _FACTORS if both_ways else (1.0,):
-                theta = model.theta.copy()
-                theta[c.index] = np.where(c.amplitude, factor, 1.0) * start
-                groups.append(np.concatenate([theta[None], self.far(added, theta)]))
+        for start, factor in itertools.product(starts, factors):
+            theta = model.theta.copy()
+            theta[c.index] = np.where(c.amplitude, factor, 1.0) * start
+            groups.append(np.concatenate([theta[None], self.far(added, theta, count)]))
         points = np.concatenate(groups)
         squares = self.positions.model(self.samples, added).squares(points)
         # The best of each start, then the best of all.

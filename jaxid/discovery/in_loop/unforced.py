@@ -47,8 +47,6 @@ from jaxid.simulation.replay import Numerics, Replay, make_replay
 from jaxid.simulation.sensor_noise import position_noise
 
 UNSEEN = "a log without a force is compared in the simulated loop, which follows no jump at break-away"
-# Points about the guesses at each start of a candidate, from which fits begin.
-_POINTS = 128
 # Samples of the window in which the residual is loudest, as a part of the log.
 _WINDOW = 0.02
 # `benchmarks.unforced`, 2026-11-26: 7 of 11 hidden effects named alone, nothing in 12 complete cases.
@@ -161,10 +159,10 @@ def _search(session: Session, machine: Machine, progress: Callable[[str], None])
         parts = parts_of(session.with_machine(alone))
         return coarse_starts(alone, parts, [choose_numerics(part.machine, part.log) for part in parts])
 
-    def far(added: Sequence[Candidate], theta: np.ndarray) -> np.ndarray:
+    def far(added: Sequence[Candidate], theta: np.ndarray, count: int) -> np.ndarray:
         at = theta.copy()
         at[superset.base] = [declared[name] for name in machine.parameters.names]
-        points = points_about(machine_with(machine, superset, added, at)[0], _POINTS)
+        points = points_about(machine_with(machine, superset, added, at)[0], count)
         if points is None:
             return at[None]
         out = np.tile(at, (len(points), 1))
