@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jaxid.discovery.search import Model, Search
 
 # Number of surrogates from which the threshold is estimated.
-_SURROGATES = 200
+SURROGATES = 200
 # A drive effect has no influence if a change by its size moves the residual by less than this part of the
 # noise (in sum of squares).
 _HIDDEN = 0.01
@@ -93,8 +93,8 @@ def screen_candidates(search: Search, model: Model, *, ahead: bool = False) -> S
     white, columns = whitener(e[..., None]), whitener(base)
 
     length = ev.stretch(out.rows)
-    surrogates = [ev.flipped(noise, length, _SURROGATES, np.random.default_rng(20240501))]
-    drawn = search.drawn_noise(model, _SURROGATES)
+    surrogates = [ev.flipped(noise, length, SURROGATES, np.random.default_rng(20240501))]
+    drawn = search.drawn_noise(model, SURROGATES)
     if drawn is not None:
         surrogates.append(whitener(np.moveaxis(drawn, 0, -1)))
     _score(out, search, white, columns, surrogates, points)

@@ -102,13 +102,14 @@ class ModelFit:
         return np.concatenate(residuals, axis=1), np.concatenate(jacobians, axis=1)
 
     def fit(
-        self, thetas: Float[np.ndarray, "starts p"], moving: np.ndarray
+        self, thetas: Float[np.ndarray, "starts p"], moving: np.ndarray, *, steps: int = _STEPS
     ) -> tuple[Float[np.ndarray, "starts p"], Float[np.ndarray, " starts"]]:
         """Fit some unknowns by least squares from each of several starts.
 
         Args:
             thetas: All unknowns of the superset at each start.
             moving: Indices of the unknowns to fit.
+            steps: Largest number of steps of each fit.
 
         Returns:
             All unknowns at the end of each fit, and its squared residual.
@@ -135,7 +136,7 @@ class ModelFit:
         out, e, jacobian, squares = at(x)
         damping = np.full(len(x), _DAMPING)
         going = np.isfinite(squares)
-        for _ in range(_STEPS):
+        for _ in range(steps):
             if not going.any():
                 break
             step = _step(e, jacobian, damping, going, x, lower, upper)

@@ -7,7 +7,6 @@ what the fitted parameters could do in its place is projected off by the search,
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -20,9 +19,10 @@ from jaxid.discovery import evidence as ev
 from jaxid.discovery.acceptance import Acceptance
 from jaxid.discovery.domain import Domain
 from jaxid.discovery.final import machine_with
+from jaxid.discovery.in_loop.afar import Afar
 from jaxid.discovery.in_loop.model_fit import ModelFit, SimulatedLog
 from jaxid.discovery.score import Score
-from jaxid.discovery.screen import Screen
+from jaxid.discovery.screen import SURROGATES, Screen
 from jaxid.discovery.search import Model, Search
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
@@ -38,11 +38,9 @@ _SPRUNG, _TURN = 4, 0.25
 _RENEWALS = 2
 # Delays beside that of a fit from which it is tried again, in rows of the log.
 _DELAYS = (-1.0, -0.5, -0.25, 0.25, 0.5, 1.0)
-# Squared residual, relative to the noise's, beyond which candidates are fitted from afar too; factors on the
-# strength of those of either sign; number of fits of each, and of those that begin at different starts.
-_FAR, _FACTORS, _STARTS, _FEW = 1.5, (-1.0, -0.1, 0.1, 1.0), 7, 4
-# Points from which these are chosen, of all starts of a candidate together, and at least at each.
-_AFAR, _LEAST = 1024, 16
+# Squared residual, relative to the noise's, beyond which candidates are fitted from afar too, and number of
+# those that are fitted from many starts to the end.
+_FAR, _AHEAD = 1.5, 5
 # Part of the motion that integration leaves wrong in any model.
 NUMERICS = 1e-5
 
@@ -327,19 +325,16 @@ class LoopSearch(Search):
         positions, logs: Those of `LoopAcceptance`.
         coarse: Function of a model that returns values of its unknowns from which fits start, beside those
             of the model: an incomplete model fits best in another valley than a complete one.
-        far: Function of effects, all unknowns and a count that returns so many points with these effects
-            about the guesses of the case.
-        scaled: Function that returns starts by kind and port, at the scales of a machine near the guesses.
+        afar: Starts far from where an incomplete model ends; None: there are none.
     """
 
     positions: PositionDomain | None = None
     logs: tuple[Loops, ...] = ()
     coarse: Callable[[Model], list[np.ndarray]] = lambda model: []
-    far: Callable[[Sequence[cand.Candidate], np.ndarray, int], np.ndarray] = lambda added, theta, n: theta[
-        None
-    ]
-    scaled: Callable[[], dict[tuple[str, int], np.ndarray]] = dict
+    afar: Afar | None = None
     _fits: dict[frozenset[int], np.ndarray] = field(default_factory=dict)
+    _searched: set[frozenset[int]] = field(default_factory=set)
+    _drawn: dict[tuple[bytes, int], np.ndarray | None] = field(default_factory=dict)
 
     def _acceptance(self) -> Acceptance:
         shared = (self.superset, self.data, self.validation, self.floor, self.colour)
@@ -363,18 +358,27 @@ class LoopSearch(Search):
         return best
 
     def widened(self, model: Model, screened: Screen) -> Screen:
-        """Return a screen with what candidates gain at fits that begin far from an incomplete model.
-
-        Much that is missing draws the unknowns of the model far away, to where no candidate helps by itself.
-        Only a model that leaves more than the noise is searched for that.
-        """
-        if self.acceptance.squares(model.theta) < _FAR * self.acceptance.noise:
+        """Return a screen with what candidates gain at fits from afar, if a model leaves more than noise."""
+        assert self.positions is not None, "given by the search"
+        if self.afar is None or self.acceptance.squares(model.theta) < _FAR * self._noise_of(model):
             return screened
-        scores = {id(s.candidate): s for s in screened.scores}
-        for c in self.rest(model):
+        rest, begun = self.rest(model), {}
+        for c in rest:
             self.progress(f"fitting with {c.label} from afar")
-            active = self.fitted_by((*model.added, c))
-            theta = self.fit_from(self._afar(model, c, active), active)
+            added, active = (*model.added, c), self.fitted_by((*model.added, c))
+            key = frozenset(active.tolist())
+            if key in self._searched:
+                begun[id(c)] = self._fits[key][None], np.zeros(1)
+                continue
+            self._searched.add(key)
+            fit = self.positions.model(self.samples, added)
+            begun[id(c)] = self.afar.begun(fit, added, model.theta, active)
+
+        scores = {id(s.candidate): s for s in screened.scores}
+        for k, c in enumerate(sorted(rest, key=lambda c: begun[id(c)][1][0])):
+            starts, active = begun[id(c)][0], self.fitted_by((*model.added, c))
+            # A candidate that is not ahead by then is fitted from its best start only.
+            theta = self.fit_from(starts[: None if k < _AHEAD else 1], active)
             e, jacobian = self.domain.evaluate(self.samples, theta, active)
             if not (np.all(np.isfinite(e)) and np.all(np.isfinite(jacobian))):
                 continue
@@ -385,29 +389,14 @@ class LoopSearch(Search):
                 scores[id(c)] = Score(c, 0 if known is None else known.start, theta[c.index], gained)
         return replace(screened, scores=sorted(scores.values(), key=lambda s: -s.evidence))
 
-    def _afar(self, model: Model, c: cand.Candidate, active: np.ndarray) -> list[np.ndarray]:
-        """Return starts of a model with a candidate: the best of many points in simulation."""
-        assert self.positions is not None, "given by the search"
-        added = (*model.added, c)
-        starts = [*c.starts, *self.scaled().get((c.kind, c.port), [])]
-        free = [self.superset.machine.parameters.free[k].sign == "free" for k in c.index]
-        factors = _FACTORS if np.any(c.amplitude & free) else (1.0,)
-        # A power of two, as sequences of low discrepancy have it.
-        count = 2 ** int(np.log2(max(_AFAR / (len(starts) * len(factors)), _LEAST)))
-        groups = []
-        for start, factor in itertools.product(starts, factors):
-            theta = model.theta.copy()
-            theta[c.index] = np.where(c.amplitude, factor, 1.0) * start
-            groups.append(np.concatenate([theta[None], self.far(added, theta, count)]))
-        points = np.concatenate(groups)
-        squares = self.positions.model(self.samples, added).squares(points)
-        # The best of each start, then the best of all.
-        group = np.repeat(np.arange(len(groups)), [len(g) for g in groups])
-        order = np.argsort(squares, kind="stable")
-        first = [order[np.flatnonzero(group[order] == k)[0]] for k in range(len(groups))]
-        first = sorted(first, key=lambda k: squares[k])[:_FEW]
-        chosen = list(dict.fromkeys([*first, *order]))[:_STARTS]
-        return [points[k] for k in chosen]
+    def _noise_of(self, model: Model) -> float:
+        """Return the sum of squares that noise leaves: of the readings, and of the loop that answers them."""
+        drawn = self.drawn_noise(model, SURROGATES)
+        if drawn is None:
+            return self.acceptance.noise
+        counts = self.samples.moving
+        answered = float(np.sum(np.where(counts, np.mean(np.square(drawn), axis=0), 0.0)))
+        return max(self.acceptance.noise, answered)
 
     def renewed(self, model: Model) -> Model:
         """Return a model refitted from many starts, with the noise of the encoder as it is beside it."""
@@ -424,7 +413,7 @@ class LoopSearch(Search):
             for samples in self.logs:
                 parts = [part.renewed(self.superset, model.added, model.theta) for part in samples.parts]
                 renewed.append(samples.with_parts(parts) if isinstance(samples, JoinedLoops) else parts[0])
-            self.logs = tuple(renewed)
+            self.logs, self._drawn = tuple(renewed), {}
             self.samples, *others = self.logs
             self.acceptance.samples, self.acceptance.others = self.samples, others
             model = replace(model, theta=self.fit(model.theta, index))
@@ -453,8 +442,13 @@ class LoopSearch(Search):
 
     def drawn_noise(self, model: Model, runs: int) -> Float[np.ndarray, "runs time n"] | None:
         """Draw residuals of the fitted logs by the noise in their loops; None if it is not known of one."""
-        drawn = [
-            part.drawn_noise(self.superset, model.added, model.theta, runs) for part in self.samples.parts
-        ]
-        known = [one for one in drawn if one is not None]
-        return np.concatenate(known, axis=1) if len(known) == len(drawn) else None
+        key = model.theta.tobytes(), runs
+        if key not in self._drawn:
+            drawn = [
+                part.drawn_noise(self.superset, model.added, model.theta, runs) for part in self.samples.parts
+            ]
+            known = [one for one in drawn if one is not None]
+            whole = np.concatenate(known, axis=1) if len(known) == len(drawn) else None
+            # Of the latest model only.
+            self._drawn = {key: whole}
+        return self._drawn[key]

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from jaxid.discovery.candidates import Candidate, CandidateModel, View
 from jaxid.discovery.final import final_machine, machine_with
+from jaxid.discovery.in_loop.afar import Afar
 from jaxid.discovery.in_loop.positions import JoinedLoops, Loops, LoopSamples, LoopSearch, PositionDomain
 from jaxid.discovery.result import Discovery, Round
 from jaxid.discovery.search import Model, Step
@@ -191,8 +192,7 @@ def _search(session: Session, machine: Machine, progress: Callable[[str], None])
             *[samples(run) for run in session.validations],
         ),
         coarse=coarse,
-        far=far,
-        scaled=scaled,
+        afar=Afar(far, scaled),
     )
     return search
 
