@@ -372,7 +372,7 @@ class Search:
         """Fit the active unknowns to the log, from and beside the others."""
         return cand.refine(self.superset, self.samples, theta, active, self.domain.evaluate)[0]
 
-    def fit_from(self, starts: Sequence[np.ndarray], active: np.ndarray) -> np.ndarray:
+    def fit_from(self, starts: Sequence[np.ndarray] | np.ndarray, active: np.ndarray) -> np.ndarray:
         """Fit the active unknowns from each of several starts, and return the best fit."""
         return min((self.fit(theta, active) for theta in starts), key=self.acceptance.squares)
 

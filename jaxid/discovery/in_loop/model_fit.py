@@ -127,7 +127,8 @@ class ModelFit:
             out[:, moving] = values
             e, jacobian = self.linearised(out, moving)
             slope = np.array([np.asarray(transform.slope(one)) for one in values])
-            squares = np.sum(np.square(e), axis=1)
+            with np.errstate(invalid="ignore", over="ignore"):  # a loop that diverged
+                squares = np.sum(np.square(e), axis=1)
             good = np.isfinite(squares) & np.all(np.isfinite(jacobian), axis=(1, 2))
             return out, e, jacobian * slope[:, None], np.where(good, squares, np.inf)
 
@@ -144,7 +145,8 @@ class ModelFit:
             tried = np.clip(x + step, lower, upper)
             there, new_e, new_jacobian, new = at(tried)
             better = going & (new < squares)
-            settled = better & (squares - new < _SAME * squares)
+            settled = np.zeros_like(better)
+            settled[better] = squares[better] - new[better] < _SAME * squares[better]
             for old, fresh in ((x, tried), (out, there), (e, new_e), (jacobian, new_jacobian)):
                 old[better] = fresh[better]
             squares = np.where(better, new, squares)

@@ -26,6 +26,7 @@ from jaxid.discovery.screen import SURROGATES, Screen
 from jaxid.discovery.search import Model, Search
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
+from jaxid.numerics.lanes import in_threads
 from jaxid.session import OpenedLog
 from jaxid.simulation.noisy_loop import ReadingNoise, drawn_readings, estimated_noise
 from jaxid.simulation.replay import Numerics, Replay, make_replay
@@ -253,19 +254,26 @@ class PositionDomain:
         self, rest: list[cand.Candidate], samples: Loops, theta: np.ndarray, residual: np.ndarray
     ) -> list[cand.Point]:
         """Linearise candidates at each of their starts, beside a model."""
+        found = in_threads(self._points_of, [(c, samples, theta, residual) for c in rest]) if rest else []
+        points = [point for some in found for point in some]
+        return [p for p in points if np.all(np.isfinite(p.columns)) and np.all(np.isfinite(p.offset))]
+
+    def _points_of(
+        self, c: cand.Candidate, samples: Loops, theta: np.ndarray, residual: np.ndarray
+    ) -> list[cand.Point]:
+        """Linearise a candidate at each of its starts."""
+        starts = [k for k in range(len(c.starts)) if not self._spring(c) or self._followed(c, k, samples)]
+        if not starts:
+            return []
+        at = np.tile(theta, (len(starts), 1))
+        at[:, c.index] = [c.probe(k) for k in starts]
         joints, out = samples.moving.shape[1], []
-        for c in rest:
-            starts = [k for k in range(len(c.starts)) if not self._spring(c) or self._followed(c, k, samples)]
-            if not starts:
-                continue
-            at = np.tile(theta, (len(starts), 1))
-            at[:, c.index] = [c.probe(k) for k in starts]
-            model = self.model(samples, self.acting(theta, c.index))
-            for k, e, columns in zip(starts, *model.linearised(at, c.index), strict=True):
-                # Faint forces leave the motion as it is.
-                shift = np.zeros_like(residual) if c.amplitude.any() else e.reshape(-1, joints) - residual
-                out.append(cand.Point(c, k, shift, columns.reshape(-1, joints, len(c.index))))
-        return [p for p in out if np.all(np.isfinite(p.columns)) and np.all(np.isfinite(p.offset))]
+        model = self.model(samples, self.acting(theta, c.index))
+        for k, e, columns in zip(starts, *model.linearised(at, c.index), strict=True):
+            # Faint forces leave the motion as it is.
+            shift = np.zeros_like(residual) if c.amplitude.any() else e.reshape(-1, joints) - residual
+            out.append(cand.Point(c, k, shift, columns.reshape(-1, joints, len(c.index))))
+        return out
 
     def _spring(self, c: cand.Candidate) -> bool:
         return cand.effect_of(self.superset, c).adds_spring
@@ -344,7 +352,7 @@ class LoopSearch(Search):
         """Fit the active unknowns to the log, from and beside the others, and from earlier fits of them."""
         return self.fit_from([theta], active)
 
-    def fit_from(self, starts: Sequence[np.ndarray], active: np.ndarray) -> np.ndarray:
+    def fit_from(self, starts: Sequence[np.ndarray] | np.ndarray, active: np.ndarray) -> np.ndarray:
         """Fit the active unknowns from each of several starts and earlier fits, and return the best fit."""
         assert self.positions is not None, "given by the search"
         if not len(active):
@@ -362,32 +370,47 @@ class LoopSearch(Search):
         assert self.positions is not None, "given by the search"
         if self.afar is None or self.acceptance.squares(model.theta) < _FAR * self._noise_of(model):
             return screened
-        rest, begun = self.rest(model), {}
-        for c in rest:
-            self.progress(f"fitting with {c.label} from afar")
-            added, active = (*model.added, c), self.fitted_by((*model.added, c))
-            key = frozenset(active.tolist())
-            if key in self._searched:
-                begun[id(c)] = self._fits[key][None], np.zeros(1)
-                continue
-            self._searched.add(key)
-            fit = self.positions.model(self.samples, added)
-            begun[id(c)] = self.afar.begun(fit, added, model.theta, active)
+        rest = self.rest(model)
+        if not rest:
+            return screened
+        self.progress(f"fitting {len(rest)} effects from afar")
+        begun = in_threads(self._begun, [(model, c) for c in rest])
+        # A candidate that is not ahead by then is fitted from its best start only.
+        order = np.argsort([squares[0] for _, squares in begun], kind="stable")
+        calls = [
+            (model, rest[i], begun[i][0][: None if k < _AHEAD else 1], screened) for k, i in enumerate(order)
+        ]
 
         scores = {id(s.candidate): s for s in screened.scores}
-        for k, c in enumerate(sorted(rest, key=lambda c: begun[id(c)][1][0])):
-            starts, active = begun[id(c)][0], self.fitted_by((*model.added, c))
-            # A candidate that is not ahead by then is fitted from its best start only.
-            theta = self.fit_from(starts[: None if k < _AHEAD else 1], active)
-            e, jacobian = self.domain.evaluate(self.samples, theta, active)
-            if not (np.all(np.isfinite(e)) and np.all(np.isfinite(jacobian))):
-                continue
+        for score in in_threads(self._scored, calls):
+            known = scores.get(id(score.candidate))
+            if known is None or score.evidence > known.evidence:
+                scores[id(score.candidate)] = score if known is None else replace(score, start=known.start)
+        return replace(screened, scores=sorted(scores.values(), key=lambda s: -s.evidence))
+
+    def _begun(self, model: Model, c: cand.Candidate) -> tuple[np.ndarray, np.ndarray]:
+        """Return the best first fits of a model with a candidate, and their squares; see `Afar.begun`."""
+        assert self.positions is not None, "given by the search"
+        assert self.afar is not None, "asked only of a search that has it"
+        added = (*model.added, c)
+        active = self.fitted_by(added)
+        fit, key = self.positions.model(self.samples, added), frozenset(active.tolist())
+        if key in self._searched:
+            known = self._fits[key][None]
+            return known, fit.squares(known)
+        self._searched.add(key)
+        return self.afar.begun(fit, added, model.theta, active)
+
+    def _scored(self, model: Model, c: cand.Candidate, starts: np.ndarray, screened: Screen) -> Score:
+        """Fit a model with a candidate from some starts, and score what the best fit gains."""
+        active = self.fitted_by((*model.added, c))
+        theta = self.fit_from(starts, active)
+        e, jacobian = self.domain.evaluate(self.samples, theta, active)
+        gained = -np.inf
+        if np.all(np.isfinite(e)) and np.all(np.isfinite(jacobian)):
             after = screened.held_out(e, jacobian[..., active])
             gained = float(ev.log_evidence(screened.rows, screened.before, after)[0])
-            known = scores.get(id(c))
-            if known is None or gained > known.evidence:
-                scores[id(c)] = Score(c, 0 if known is None else known.start, theta[c.index], gained)
-        return replace(screened, scores=sorted(scores.values(), key=lambda s: -s.evidence))
+        return Score(c, 0, theta[c.index], gained)
 
     def _noise_of(self, model: Model) -> float:
         """Return the sum of squares that noise leaves: of the readings, and of the loop that answers them."""
