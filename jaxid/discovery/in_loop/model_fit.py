@@ -126,11 +126,11 @@ class ModelFit:
             out = thetas.copy()
             out[:, moving] = values
             e, jacobian = self.linearised(out, moving)
-            slope = np.array([np.asarray(transform.slope(one)) for one in values])
             with np.errstate(invalid="ignore", over="ignore"):  # a loop that diverged
+                jacobian = jacobian * np.array([np.asarray(transform.slope(one)) for one in values])[:, None]
                 squares = np.sum(np.square(e), axis=1)
             good = np.isfinite(squares) & np.all(np.isfinite(jacobian), axis=(1, 2))
-            return out, e, jacobian * slope[:, None], np.where(good, squares, np.inf)
+            return out, e, jacobian, np.where(good, squares, np.inf)
 
         inward = np.array([np.asarray(transform.inward(theta[moving])) for theta in thetas])
         x = np.clip(inward, lower, upper)
