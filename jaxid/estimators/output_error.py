@@ -44,7 +44,7 @@ from jaxid.machine import Machine
 from jaxid.model.unknowns import REFERENCE
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
-from jaxid.numerics.misspecified import std_under_misspecification
+from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.precision import Precision, Rows, assess_together, hessian_notes
 from jaxid.simulation.noisy_loop import ReadingNoise
 from jaxid.simulation.replay import (
@@ -274,6 +274,10 @@ def _estimate(
     values = np.concatenate([end.theta, end.starts])
     x, full = values[active], (yield from fit.hessian(end)) if hessian else None
     precision = assess_together(names, moving, np.where(x != 0, x, 1.0), full, crossed=fit.on == "both")
+    if fit.unforced:
+        # Mean readings of a coarse encoder are off at its steps: the residual has no one size.
+        lengths = [len(log.residual) for log in moving]
+        precision = precision.widened(widening(precision, *stacked(moving), lengths))
     precision = precision.first(machine.parameters.names)
 
     details: dict[str, Any] = {}

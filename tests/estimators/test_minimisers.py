@@ -157,6 +157,7 @@ def axis_fit(closed: bool, name: str | None):
     return output_error(m, data, start=start, numerics=coarse, minimiser=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("closed", "name"), [(True, "optimistix.Dogleg"), (False, "optimistix.BFGS")])
 def test_an_axis_is_fitted_alike_by_all(closed, name):
     here, there = axis_fit(closed, None), axis_fit(closed, name)

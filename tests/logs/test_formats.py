@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -458,3 +459,40 @@ def test_tables_in_memory_have_their_units():
     data = xarray.Dataset({"q": ("t", 1e3 * Q), "u": ("t", U)}, coords={"t": T})
     check(as_log(data, {**COLUMNS, "units": {"position": "mm"}}))
     check(as_log(pandas.DataFrame({"t": 1e3 * T, "q": Q, "u": U}), {**COLUMNS, "units": {"time": "ms"}}))
+
+
+MEASURE = """
+import sys, time
+from jaxid.logs.log import read_log
+columns = {"time": "header.stamp", "position": "/joint_states.position[elbow]"}
+columns["force"] = "/joint_states.effort[elbow]"
+def peak():
+    # The peak of getrusage is at least that of the process that started this one.
+    [line] = [line for line in open("/proc/self/status") if line.startswith("VmHWM")]
+    return 1024 * int(line.split()[1])
+read_log(sys.argv[2], columns)
+before, start = peak(), time.perf_counter()
+log = read_log(sys.argv[1], columns)
+print(time.perf_counter() - start, peak() - before, log.samples)
+"""
+
+
+@pytest.mark.slow
+def test_a_tenth_of_an_hour_at_1_khz(tmp_path):
+    """An hour is to be read in 90 s, with memory of at most twice the file."""
+    count = 360_000
+
+    def messages(many):
+        for k in range(many):
+            message = joint_state(STORE, EPOCH + k * 1e-3, ["shoulder", "elbow"], [0.0, k * 1e-6], [0.0, 1.0])
+            yield "/joint_states", "sensor_msgs/msg/JointState", EPOCH + k * 1e-3, message
+
+    large = write_bag(tmp_path / "large", StoragePlugin.MCAP, messages(count))
+    small = write_bag(tmp_path / "small", StoragePlugin.MCAP, messages(1000))
+    command = [sys.executable, "-c", MEASURE, str(large), str(small)]
+    runs = [subprocess.run(command, check=True, capture_output=True, text=True).stdout for _ in range(2)]
+    seconds, memory, samples = np.array([run.split() for run in runs], dtype=float).min(axis=0)
+    print(f"{seconds:.1f} s, {memory / 1e6:.0f} MB")
+    assert samples == count
+    assert seconds < 9.0
+    assert memory < 2 * sum(p.stat().st_size for p in large.iterdir())

@@ -235,7 +235,7 @@ def test_an_open_loop_with_a_clearance_is_doubted(tmp_path, folder):
     for case in (open_loop, open_loop.replace("[actuator]", spring + "[actuator]")):
         (tmp_path / "case.toml").write_text(case)
         session = open_session(tmp_path / "case.toml", folder / "log.csv")
-        said.append(" ".join(_doubts_of_output_error(session)))
+        said.append(" ".join(_doubts_of_output_error(session.machine)))
     assert "clearance" not in said[0]
     assert "hangs on every impact in a clearance" in said[1]
 

@@ -111,7 +111,7 @@ def test_derivatives_of_accelerations_are_pinocchios():
         close(b, c, 1e-9)
 
 
-@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize("name", ["arm", pytest.param("branched", marks=pytest.mark.slow)])
 def test_derivatives_of_any_order_are_those_of_the_recursion(name):
     """First and second derivatives by every argument, forward and reverse, geometry and gravity included."""
     tree, geometry, parameters, motion = made(name)

@@ -19,8 +19,6 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.controllers import Controller
 from jaxid.controllers.linear import PD, CascadePD
-from jaxid.effects.friction import LoadFriction
-from jaxid.estimators.apart.gear import GearFriction
 from jaxid.estimators.several.parts import Part
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
@@ -94,7 +92,7 @@ def stands_apart(machine: Machine, parts: Sequence[Part]) -> bool:
         return False
     # The links' forces would pass through an effect in the drive; only a gear's friction knows them.
     through = [e for e in plant.effects if (e.in_drive or e.needs_drive) and e.controller_field is None]
-    if not all(type(e) is LoadFriction for e in through):
+    if not all(e.knows_links() for e in through):
         return False
     if any(_joint_of(f, machine) is None or f.log is not None for f in machine.parameters.free):
         return False
@@ -185,10 +183,7 @@ def _machine(machine: Machine, joint: int, links: float, load: Any, period: floa
     effects: tuple[Effect, ...] = tuple(replace(plant.effects[k], port=0) for k in numbers)
     if load is not None:
         beside = np.ravel(load)
-        effects = tuple(
-            GearFriction.of(e, beside, period, law.period) if isinstance(e, LoadFriction) else e
-            for e in effects
-        )
+        effects = tuple(e.without_links(beside, period, law.period) for e in effects)
     scale = plant.smoothing.velocity_scale
     smoothing = replace(plant.smoothing, velocity_scale=scale if np.ndim(scale) == 0 else scale[joint])
     free = [
