@@ -443,8 +443,9 @@ class Search:
             columns = np.zeros((*e.shape, len(unknowns)))
             columns[..., shown] = jacobian[..., [unknowns[j].index for j in shown]]
             weight = log.samples.weight / log.smallest
-            residuals.append((e * weight).ravel())
-            jacobians.append((columns * weight[..., None]).reshape(-1, len(unknowns)))
+            with np.errstate(over="ignore", invalid="ignore"):  # a loop that diverged: the step is refused
+                residuals.append((e * weight).ravel())
+                jacobians.append((columns * weight[..., None]).reshape(-1, len(unknowns)))
         return np.concatenate(residuals), np.concatenate(jacobians)
 
 
