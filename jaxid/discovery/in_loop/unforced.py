@@ -50,10 +50,10 @@ from jaxid.simulation.sensor_noise import position_noise
 UNSEEN = "a log without a force is compared in the simulated loop, which follows no jump at break-away"
 # Samples of the window in which the residual is loudest, as a part of the log.
 _WINDOW = 0.02
-# `benchmarks.unforced`, 2026-11-26: 7 of 11 hidden effects named alone, nothing in 12 complete cases.
+# `benchmarks.unforced`, 2026-11-26: 20 of 21 hidden effects named alone, nothing in 12 complete cases.
 _UNPROVEN = (
-    "without a force the effect that is named may stand for another one, as in 3 of 11 cases of the "
-    "benchmark: hold what was found against another log (docs/without_a_force.md)"
+    "without a force the effect that is named may stand for another one, if rarely in the benchmark: hold "
+    "what was found against another log (docs/without_a_force.md)"
 )
 
 
