@@ -170,7 +170,7 @@ def witness(
     start = np.clip(best, _END * ends, (1.0 - _END) * ends)
     found = scipy.optimize.least_squares(left, start, bounds=(0.0, ends), x_scale=ends, diff_step=_END)
     at = min((best, found.x), key=lambda at: float(np.sum(left(at) ** 2)))
-    # What cannot be told from none is none.
+    # What cannot be distinguished from none is none.
     none = np.maximum(2.0 * _END * ends, np.array([_SAMPLE * period, _SAMPLE * period, 0.0])[: ends.size])
     at = np.where(at < none, 0.0, at)
     residual, gain, offset = _fitted(effort, shaped(at))

@@ -1,7 +1,7 @@
 """The scale of a loop's forces from a current or load of known gain, and how far such a column agrees.
 
-A loop without a force tells all forces but for one factor. A column that follows the force, with a gain that
-is known, tells that factor; without its gain it says how much of it the fitted force explains.
+A log without a force determines all forces but for one factor. A column that follows the force, with a gain
+that is known, determines that factor. Without its gain the fitted force still explains a part of the column.
 """
 
 from __future__ import annotations

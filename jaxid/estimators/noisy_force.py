@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.estimators.common.scores import Scores
+from jaxid.estimators.common.scores import Scores, changes_by_pairs
 from jaxid.estimators.simulated_output import output_residual
 from jaxid.model.plant import Plant
 from jaxid.numerics.kept import kept_jit
@@ -52,20 +51,14 @@ def _changes(
     on: str,
     noise: Array,
 ) -> tuple[Array, Array]:
-    """Return the odd and the even change of the residual by each pair of noise, (pairs, time, k) each."""
+    """Return the even and the odd change of the residual by each pair of noise of the force."""
 
     def residual(noise: Array) -> Array:
         assert replay.command is not None, "make_replay gives an open loop its command"
         pushed = eqx.tree_at(lambda r: r.command, replay, replay.command + noise)
         return output_residual(pushed, places, plant, measured, weight, on)(theta)
 
-    quiet = residual(0.0 * noise[0])
-
-    def both(noise: Array) -> tuple[Array, Array]:
-        plus, minus = residual(noise), residual(-noise)
-        return 0.5 * (plus - minus), 0.5 * (plus + minus) - quiet
-
-    return jax.lax.map(both, noise)
+    return changes_by_pairs(residual, noise)
 
 
 def pushed_steps(
@@ -86,15 +79,15 @@ def pushed_steps(
         Cook & Stefanski (1994), JASA 89, simulation-extrapolation.
     """
     rng = np.random.default_rng(0)
-    odd, even = Scores.none(logs[0][3], pairs), Scores.none(logs[0][3], pairs)
+    none = Scores.none(logs[0][3], pairs)
+    even, odd = none, none
     of_readings = np.zeros_like(odd.normal)
     for (replay, *others), force_std, output_std, rows in logs:
         noise = noise_of_command(replay, force_std, rng, pairs)
         found = yield SolveRequest(_changes, (replay, *others, on, noise))
-        odd, even = (s.with_log(rows, np.asarray(x)) for s, x in zip((odd, even), found, strict=True))
-        loud = (np.where(rows.counts[..., None], rows.jacobian, 0.0) * output_std[:, None]).reshape(
-            -1, len(of_readings)
-        )
+        even, odd = (s.with_log(rows, np.asarray(x)) for s, x in zip((even, odd), found, strict=True))
+        counted = np.where(rows.counts[..., None], rows.jacobian, 0.0)
+        loud = (counted * output_std[:, None]).reshape(-1, len(of_readings))
         of_readings += rows.weight**2 * loud.T @ loud
     steps = odd.steps()
     covariance = steps.T @ steps / pairs + odd.inverse @ of_readings @ odd.inverse

@@ -359,12 +359,14 @@ def _without_noise(
 def _noise_of(output: Output, rows: Rows) -> np.ndarray:
     """Return the standard deviation of a log's readings: no more than readings and residual show, (n,)."""
     part, n = output.part, output.part.log.position.shape[1]
-    noise = np.minimum(position_noise(part.machine, part.log), signals.high_band_std(part.log.readings))
+    # A joint without an encoder has no readings, and no noise.
+    noise = np.fmin(position_noise(part.machine, part.log), signals.high_band_std(part.log.readings))
     if rows.residual.shape[1] != n:
         return noise
     # In a slow log motion reaches the highest frequencies, and counts as noise there.
     counts = np.maximum(rows.counts.sum(axis=0), 1)
-    return np.minimum(noise, np.sqrt(np.sum(np.where(rows.counts, rows.residual, 0.0) ** 2, axis=0) / counts))
+    left = np.sqrt(np.sum(np.where(rows.counts, rows.residual, 0.0) ** 2, axis=0) / counts)
+    return np.fmin(noise, left)
 
 
 def _pushed(
@@ -387,16 +389,19 @@ def _pushed(
         return unchanged
     sizes = ", ".join(f"{x:.2g}" for x in np.max(noise, axis=0))
     exact = f"an open-loop simulation takes the logged force as exact, but it holds noise of about {sizes}"
+    too_small = f"{exact}: the standard deviations are too small, use prediction_error"
     if any(o.numerics.segment for o in fit.outputs):
         # A restart adds the noise of its state, of which the size is not known.
-        return end.theta, precision, [f"{exact}: the standard deviations are too small, use prediction_error"]
+        return end.theta, precision, [too_small]
     arguments = [o.arguments(end.theta, end.starts[p]) for o, p in zip(fit.outputs, fit.places, strict=True)]
     readings = [_noise_of(output, log) for output, log in zip(fit.outputs, end.logs, strict=True)]
     logs = list(zip(arguments, noise, readings, moving, strict=True))
     pushed = yield from pushed_steps(logs, fit.on)
     p, seen = fit.unknowns, precision.identifiable
-    if not np.all(np.isfinite(pushed.covariance)) or not np.any(seen):
+    if not np.any(seen):
         return unchanged
+    if not np.all(np.isfinite(pushed.covariance)):
+        return end.theta, precision, [too_small]
     theta = np.clip(end.theta + np.where(seen, pushed.bias[:p], 0.0), *fit.machine.parameters.bounds)
     whole = precision.with_at_least(pushed.covariance[:p, :p])
     if np.all(whole.std[seen] <= _SLIGHTLY * precision.std[seen]):

@@ -1,4 +1,4 @@
-"""Bias of output error by the noise of the readings, which goes round the loop, and its removal.
+"""Bias and scatter of output error by the noise of the readings, which goes round the loop.
 
 The simulated loop has no noise. That of a real one dithers the friction at every reversal, and moves the mean
 of the position by the square of the noise.
@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.estimators.common.scores import Scores
+from jaxid.estimators.common.scores import Scores, changes_by_pairs
 from jaxid.estimators.simulated_output import output_residual
 from jaxid.model.plant import Plant
 from jaxid.numerics.kept import kept_jit
@@ -54,13 +53,7 @@ def _changes(
 ) -> tuple[Float[Array, "pairs time k"], Float[Array, "pairs time k"]]:
     """Return the even and the odd change of the residual by each pair of opposite noise."""
     residual = lambda noise: output_residual(replay, places, plant, measured, weight, on, noise)(theta)
-    quiet = output_residual(replay, places, plant, measured, weight, on)(theta)
-
-    def both(noise: Array) -> tuple[Array, Array]:
-        plus, minus = residual(noise), residual(-noise)
-        return 0.5 * (plus + minus) - quiet, 0.5 * (plus - minus)
-
-    return jax.lax.map(both, noise)
+    return changes_by_pairs(residual, noise)
 
 
 def shift_steps(

@@ -247,15 +247,12 @@ def with_known_scale(
     if beside is not None:
         beside = np.insert(beside, base, 0.0)
         beside = np.where(scaled, np.hypot(scale.factor * beside, scale.std * held), beside)
-    white = estimate.precision.equivalent_variance
-    precision = Precision(
-        covariance,
-        identifiable,
-        estimate.precision.unidentifiable,
-        np.append(estimate.precision.information, 1.0),
-        estimate.precision.kind,
-        estimate.precision.curvature,
-        None if white is None else np.insert(white, base, np.nan),
+    precision = replace(
+        estimate.precision,
+        covariance=covariance,
+        identifiable=identifiable,
+        information=np.append(estimate.precision.information, 1.0),
+        equivalent_variance=_with_gap(estimate.precision.equivalent_variance, base),
     )
     return replace(
         estimate,
@@ -277,16 +274,19 @@ def free_precision(old: Precision, machine: Machine, group: tuple[int, ...], bas
     # Relative to their values all of the group move by the same part.
     weight = 1 / np.sqrt(len(group))
     combination = {machine.parameters.free[k].name: weight for k in group}
-    white = old.equivalent_variance
-    return Precision(
-        covariance,
-        identifiable,
-        [*old.unidentifiable, combination],
-        np.append(0.0, old.information),
-        old.kind,
-        old.curvature,
-        None if white is None else np.insert(white, base, np.nan),
+    return replace(
+        old,
+        covariance=covariance,
+        identifiable=identifiable,
+        unidentifiable=[*old.unidentifiable, combination],
+        information=np.append(0.0, old.information),
+        equivalent_variance=_with_gap(old.equivalent_variance, base),
     )
+
+
+def _with_gap(values: np.ndarray | None, base: int) -> np.ndarray | None:
+    """Return values of all unknowns, with NaN for the one that was held."""
+    return None if values is None else np.insert(values, base, np.nan)
 
 
 def fitted_with_noise(

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from benchmarks.unforced import covered, of
 from jaxid.errors import InputError
 from truth.axis.machines import Setup, moves, multisine
 from truth.axis.stepper import Loop, Machine, Sensor
@@ -201,3 +202,9 @@ def test_a_payload_that_is_known_gives_the_scale(tmp_path):
         found = result.parameters[name]
         assert found.identifiable, name
         assert abs(found.value - true) < 4 * found.std, name
+
+
+@pytest.mark.slow
+def test_the_steps_of_a_coarse_encoder_widen_the_intervals():
+    """Its Coulomb friction was 5 standard deviations off."""
+    assert np.all(np.abs([*covered(of("coverage", 2))["z"].values()]) < 3.5)

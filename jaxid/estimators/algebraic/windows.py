@@ -37,7 +37,7 @@ from jaxid.simulation.force_balance import ForceData, sharpened
 # Share of the intervals that hold the truth, by `benchmarks.intervals`.
 _NARROW = (
     "its standard deviations are too small: 74 to 83 % of such 95 % intervals held the truth on simulated "
-    "axes and chains (benchmarks.intervals); inverse_dynamics has 90 to 95 %"
+    "axes and chains (benchmarks.intervals); inverse_dynamics has 90 to 94 %"
 )
 # to separate inertia from friction, longer ones too much drift of the noise.
 _WINDOW_PERIODS = 20

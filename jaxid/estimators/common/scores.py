@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.arrays import Array
 from jaxid.numerics.precision import Rows
 
 # Eigenvalue of the scaled normal matrix, relative to the largest, below which a direction does not move.
 _BLIND = 1e-10
+
+
+def changes_by_pairs(
+    residual: Callable[[Array], Array], noise: Float[Array, "pairs ticks n"]
+) -> tuple[Float[Array, "pairs time k"], Float[Array, "pairs time k"]]:
+    """Return the even and the odd change of a residual by each pair of opposite noise.
+
+    Args:
+        residual: Residual as a function of the noise of a run, (time, k).
+        noise: Noise of one run of each pair.
+    """
+    quiet = residual(0.0 * noise[0])
+
+    def both(noise: Array) -> tuple[Array, Array]:
+        plus, minus = residual(noise), residual(-noise)
+        return 0.5 * (plus + minus) - quiet, 0.5 * (plus - minus)
+
+    return jax.lax.map(both, noise)
 
 
 @dataclass(frozen=True)
