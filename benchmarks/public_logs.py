@@ -8,7 +8,6 @@ goes on from there, and rewrites the table DIR/public_logs.md from all of them. 
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -18,6 +17,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from benchmarks.measured import measured_folder
 from benchmarks.public_logs_table import ROWS, Row
 
 HERE = Path(__file__).parent / "results"
@@ -140,9 +140,7 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="run logs that have a result already")
     parser.add_argument("-o", type=Path, default=HERE)
     args = parser.parse_args()
-    if "JAXID_DATA" not in os.environ:
-        parser.error("set JAXID_DATA to the folder of the measured data")
-    data = Path(os.environ["JAXID_DATA"])
+    data = measured_folder(parser)
     kept = args.o / "public_logs.jsonl"
     lines = kept.read_text().splitlines() if kept.exists() else []
     records = {entry["file"]: entry for entry in map(json.loads, lines)}

@@ -10,7 +10,6 @@ so101.md and so101.svg.
 
 import argparse
 import json
-import os
 import tempfile
 import time
 from datetime import date
@@ -22,6 +21,7 @@ import numpy as np
 
 import jaxid
 from benchmarks.cold import commit_of
+from benchmarks.measured import measured_folder
 from benchmarks.so101_picture import picture
 from jaxid.gap import SimulationGap, simulation_of_log
 from jaxid.logs.log import Log
@@ -254,9 +254,7 @@ def main() -> None:
     parser.add_argument("--joint", type=int, action="append", default=[], help="1 to 5; may be repeated")
     parser.add_argument("-o", type=Path, default=HERE)
     args = parser.parse_args()
-    if "JAXID_DATA" not in os.environ:
-        parser.error("set JAXID_DATA to the folder of the measured data")
-    data = Path(os.environ["JAXID_DATA"]) / "so101"
+    data = measured_folder(parser, "so101")
     kept = args.o / "so101.json"
     logs = motions(data)
     for joint in args.joint or range(1, len(JOINTS) + 1):

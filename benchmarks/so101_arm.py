@@ -9,7 +9,6 @@ Then the same case is fitted with what an MJCF does not hold, and `jaxid export 
 
 import argparse
 import json
-import os
 import resource
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
+from benchmarks.measured import measured_folder
 from benchmarks.stored_runs import commit_of
 
 ROOT = Path(__file__).parents[1]
@@ -33,45 +33,67 @@ JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 
 
 def main() -> int:
-    """Run the command, and write the page."""
+    """Run the commands, and write the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("-o", metavar="DIR", type=Path, default=HERE)
     options = parser.parse_args()
-    if "JAXID_DATA" not in os.environ:
-        parser.error("set JAXID_DATA to the folder of the measured data")
-    data = Path(os.environ["JAXID_DATA"]) / "so101"
+    data = measured_folder(parser, "so101")
 
     with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "out"
-        command = ["identify", str(data / "so101.xml"), *(str(data / f"{name}.csv") for name in FITTED)]
-        for name in LEFT_OUT:
-            command += ["--validate", str(data / f"{name}.csv")]
-        plain = Ran.of([*command, "-o", str(out)])
-        if not (out / "result.json").exists():
-            print(plain.error, file=sys.stderr)
-            return 1
-        first = json.loads((out / "result.json").read_text())
-        case = (out / "first_case.toml").read_text() + "".join(map(_effects, range(1, 7)))
-        (out / "more.toml").write_text(case)
-        command[1], more = str(out / "more.toml"), Path(folder) / "more"
-        fuller = Ran.of([*command, "-o", str(more)])
-        if not (more / "result.json").exists():
-            print(fuller.error, file=sys.stderr)
-            return 1
-        second = json.loads((more / "result.json").read_text())
-        export = [
-            "export",
-            str(more / "result.json"),
-            "--to",
-            "mjcf",
-            "-o",
-            str(more / "found.xml"),
-            "--force",
-        ]
-        checked = {name: Ran.of([*export, "--check", str(data / f"{name}.csv")]).text for name in CHECKED}
+        found = _found(data, Path(folder))
+    if found is None:
+        return 1
+    page = _page(found)
+    (options.o / "so101_arm.md").write_text(page)
+    print(page)
+    return 0
 
+
+@dataclass(frozen=True)
+class Found:
+    """Outcome of the commands.
+
+    Args:
+        plain: Fit of the servos as the MJCF knows them, and its result.
+        fuller: Fit with what an MJCF does not hold, and its result.
+        checked: What `jaxid export --check` prints of the second fit, by motion.
+    """
+
+    plain: "Ran"
+    first: dict
+    fuller: "Ran"
+    second: dict
+    checked: dict[str, str]
+
+
+def _found(data: Path, folder: Path) -> Found | None:
+    """Run the commands on the files in a folder; None if a fit has left no result."""
+    out, more = folder / "out", folder / "more"
+    motions = [str(data / f"{name}.csv") for name in FITTED]
+    for name in LEFT_OUT:
+        motions += ["--validate", str(data / f"{name}.csv")]
+
+    plain = Ran.of(["identify", str(data / "so101.xml"), *motions, "-o", str(out)])
+    first = plain.result(out)
+    if first is None:
+        return None
+    case = (out / "first_case.toml").read_text() + "".join(map(_effects, range(1, 7)))
+    (out / "more.toml").write_text(case)
+    fuller = Ran.of(["identify", str(out / "more.toml"), *motions, "-o", str(more)])
+    second = fuller.result(more)
+    if second is None:
+        return None
+
+    export = ["export", str(more / "result.json"), "--to", "mjcf", "-o", str(more / "found.xml"), "--force"]
+    checked = {name: Ran.of([*export, "--check", str(data / f"{name}.csv")]).text for name in CHECKED}
+    return Found(plain, first, fuller, second, checked)
+
+
+def _page(found: Found) -> str:
+    """Return the page."""
+    plain, first, fuller, second = found.plain, found.first, found.fuller, found.second
     replay = plain.text[plain.text.index("replay by MuJoCo") :].rstrip()
     shown = f"jaxid identify so101.xml {' '.join(f'{n}.csv' for n in FITTED)} --validate ... -o out"
     lines = [
@@ -107,12 +129,10 @@ def main() -> int:
         "and the friction by load; the friction of the file above was fitted without them, and stands in for",
         "them.",
     ]
-    for name, text in checked.items():
+    for name, text in found.checked.items():
         table = text[text.index("replay by MuJoCo") :].rstrip()
         lines += ["", f"{name}:", "", "```", table, "```"]
-    (options.o / "so101_arm.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
-    return 0
+    return "\n".join(lines) + "\n"
 
 
 @dataclass(frozen=True)
@@ -141,6 +161,13 @@ class Ran:
         wall = time.perf_counter() - begin
         cpu = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
         return cls(done.stdout, done.stderr, done.returncode, wall, cpu)
+
+    def result(self, folder: Path) -> dict | None:
+        """Return the result that it wrote into a folder; None, and its error printed, if there is none."""
+        if not (folder / "result.json").exists():
+            print(self.error, file=sys.stderr)
+            return None
+        return json.loads((folder / "result.json").read_text())
 
 
 def _yes(flag: bool) -> str:

@@ -12,7 +12,6 @@ Writes so101_cmaes.json and so101_cmaes.md.
 import argparse
 import copy
 import json
-import os
 import resource
 import subprocess
 import sys
@@ -29,6 +28,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout as threads
 
+from benchmarks.measured import measured_folder
 from benchmarks.so101 import JOINTS, ROW, STEP, columns, motions, rollout
 from benchmarks.so101_arm import FITTED, LEFT_OUT
 from benchmarks.stored_runs import commit_of
@@ -306,9 +306,7 @@ def main() -> None:
     )
     parser.add_argument("-o", metavar="DIR", type=Path, default=HERE)
     options = parser.parse_args()
-    if "JAXID_DATA" not in os.environ:
-        parser.error("set JAXID_DATA to the folder of the measured data")
-    data, kept = Path(os.environ["JAXID_DATA"]) / "so101", options.o / "so101_cmaes.json"
+    data, kept = measured_folder(parser, "so101"), options.o / "so101_cmaes.json"
     for fit in options.fit or [*FITS, "jaxid"]:
         run = by_jaxid(data) if fit == "jaxid" else by_strategy(data, fit)
         content = json.loads(kept.read_text()) if kept.exists() else {"runs": {"file": by_file(data)}}

@@ -8,7 +8,6 @@ The model of a joint is that of `benchmarks.so101`. Writes so101_compare.json an
 
 import argparse
 import json
-import os
 import tempfile
 import time
 from datetime import date
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 import jaxid
+from benchmarks.measured import measured_folder
 from benchmarks.so101 import FITTED, JOINTS, MOVES, ROW, TOUCHING, case_of, motions
 from benchmarks.stored_runs import commit_of
 
@@ -115,10 +115,8 @@ def main() -> None:
     parser.add_argument("--joint", type=int, action="append", default=[], help="1 to 5; may be repeated")
     parser.add_argument("-o", type=Path, default=HERE)
     args = parser.parse_args()
-    if "JAXID_DATA" not in os.environ:
-        parser.error("set JAXID_DATA to the folder of the measured data")
     kept = args.o / "so101_compare.json"
-    logs = motions(Path(os.environ["JAXID_DATA"]) / "so101")
+    logs = motions(measured_folder(parser, "so101"))
     for joint in args.joint or range(1, len(JOINTS) + 1):
         record = run(joint, logs)
         content = json.loads(kept.read_text()) if kept.exists() else {"joints": []}

@@ -8,7 +8,6 @@ a magnitude, stands beside the log as `[log] effort`. Writes so101_effort.json a
 
 import argparse
 import json
-import os
 import time
 from datetime import date
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 import jaxid
+from benchmarks.measured import measured_folder
 from benchmarks.so101 import HERE, JOINTS, ROOT, ROW, ROWS, case_of, motions
 from benchmarks.stored_runs import commit_of
 
@@ -72,9 +72,7 @@ def main() -> None:
     )
     parser.add_argument("-o", metavar="DIR", type=Path, default=HERE)
     options = parser.parse_args()
-    if "JAXID_DATA" not in os.environ:
-        parser.error("set JAXID_DATA to the folder of the measured data")
-    motion = motions(Path(os.environ["JAXID_DATA"]) / "so101")[MOTION][:ROWS]
+    motion = motions(measured_folder(parser, "so101"))[MOTION][:ROWS]
     joints = [run(joint, motion) for joint in range(1, len(JOINTS) + 1)]
     content = {"commit": commit_of(ROOT), "date": date.today().isoformat(), "joints": joints}
     (options.o / "so101_effort.json").write_text(json.dumps(content, indent=1) + "\n")
