@@ -32,6 +32,7 @@ from benchmarks.measured import measured_folder
 from benchmarks.so101 import JOINTS, ROW, STEP, columns, motions, rollout
 from benchmarks.so101_arm import FITTED, LEFT_OUT
 from benchmarks.stored_runs import commit_of
+from jaxid.export.soft_friction import Softness
 
 HERE = Path(__file__).parent / "results"
 ROOT = Path(__file__).parents[1]
@@ -50,6 +51,8 @@ RANGES = {
 }
 PACE = ("armature", "damping", "frictionloss", "bias", "delay")
 FITS = {"pace": PACE, "gains": (*PACE, "kp", "kv"), "stiff": (*PACE, "kp", "kv")}
+# MuJoCo's own softness of dry friction.
+SOFT = Softness((0.02, 1.0), (0.9, 0.95))
 # Evaluations of the three motions, and candidates in one generation.
 EVALUATIONS, POPULATION = 960, 16
 # The start is the middle of all ranges, with this standard deviation in units of a range.
@@ -79,12 +82,6 @@ class Course:
         """Return the command of each joint, (steps, joints), by its delay [s] in whole steps."""
         at = np.arange(len(self.held))[:, None] - np.round(delays / STEP).astype(int)
         return np.take_along_axis(self.commands, self.held[np.maximum(at, 0)], axis=0)
-
-
-# Softness of dry friction, `solreffriction` and `solimpfriction`: a time constant of two steps, below which
-# MuJoCo advises against it, with the largest impedance that it takes; and MuJoCo's own.
-STIFF = (2 * 0.002, 1.0), (0.9999, 0.9999, 0.001, 0.5, 2.0)
-SOFT = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
 
 
 def model_of(base: mujoco.MjModel, values: dict[str, np.ndarray]) -> mujoco.MjModel:
@@ -161,15 +158,19 @@ def base_model(data: Path) -> mujoco.MjModel:
 
 def stiffened(model: mujoco.MjModel) -> mujoco.MjModel:
     """Return a model whose dry friction is as stiff as it can be."""
-    model = copy.copy(model)
-    model.dof_solref[:], model.dof_solimp[:] = STIFF
-    return model
+    return with_softness(model, Softness.least(STEP))
 
 
 def softened(model: mujoco.MjModel) -> mujoco.MjModel:
     """Return a model whose dry friction is as soft as MuJoCo's own."""
+    return with_softness(model, SOFT)
+
+
+def with_softness(model: mujoco.MjModel, softness: Softness) -> mujoco.MjModel:
+    """Return a model with one softness of the dry friction of all joints."""
     model = copy.copy(model)
-    model.dof_solref[:], model.dof_solimp[:] = SOFT
+    for dof in range(model.nv):
+        softness.put(model, dof)
     return model
 
 
