@@ -4,7 +4,7 @@
 
 *First*: nothing was compiled before; *again*: with the compiled code of the first. Prints a row each, with
 the fewest seconds of all repeats on the wall and of the processor, and writes results/cold.md and cold.json.
-With --only, the other rows stay as they were written before. `--long` adds searches that take minutes.
+With --only, the other rows stay as they were written before. `--long` adds commands that take minutes.
 """
 
 import argparse
@@ -34,7 +34,8 @@ COMMAND = "from jaxid.cli import entry; entry()"
 SEARCH = "import sys; from jaxid import _cache; _cache.configure(); import jaxid; " + (
     "jaxid.discover(*sys.argv[1:], refit=False)"
 )
-# Seconds: of a refusal or a list, of `identify` first and again, of the median search from cold.
+# Seconds: of a refusal or a list, of `identify` first and again, of the median search from cold, of a search
+# on a robot, of the fit of an arm's simulation.
 AIMS = {
     "refusal": 0.3,
     "list": 0.3,
@@ -42,6 +43,7 @@ AIMS = {
     "identify again": 2.0,
     "discover first": 8.0,
     "long": 60.0,
+    "long fit": 15.0,
 }
 
 
@@ -157,25 +159,28 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
             *middle, status = np.median(seconds, axis=0)
             what = f"discover, median of {len(seconds)}"
             add(what, "discover first", [(*map(float, middle), int(status))], of)
-    if options.long and only in "discover long":
-        for what, write in long_searches().items():
+    if options.long:
+        for what, (group, write) in long_commands().items():
+            if only not in f"{group} {what}":
+                continue
             with tempfile.TemporaryDirectory() as room:
                 words = write(Path(room))
                 if words:
                     code = SEARCH if "no refit" in what else COMMAND
-                    add(f"discover, {what}", "long", [timed(words, Path(room), code)])
+                    add(what, group, [timed(words, Path(room), code)])
     return rows
 
 
-def long_searches() -> dict[str, Callable[[Path], list[str] | None]]:
-    """Return searches that take minutes: name -> function that writes their files and returns arguments."""
-    from benchmarks.long_searches import FIVE_BAR, arm, five_bar
+def long_commands() -> dict[str, tuple[str, Callable[[Path], list[str] | None]]]:
+    """Return commands that take minutes: name -> group, function that writes files and returns arguments."""
+    from benchmarks.long_commands import FIVE_BAR, five_bar, seven_joints, tx40_search
 
     robots = {
-        what: lambda room, name=name: ["discover", *five_bar(room, name), "--quiet"]
+        f"discover, {what}": ("long", lambda room, name=name: ["discover", *five_bar(room, name), "--quiet"])
         for name, what in FIVE_BAR.items()
     }
-    return {"TX40, no refit": arm, **robots}
+    fit = "identify --method output_error, PA-10 with 57 unknowns"
+    return {"discover, TX40, no refit": ("long", tx40_search), fit: ("long fit", seven_joints), **robots}
 
 
 def first_and_again(words: list[str], repeats: int) -> tuple[list, list]:
@@ -264,7 +269,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--cases", type=int, default=6, help="cases of `discover`")
-    parser.add_argument("--long", action="store_true", help="searches that take minutes too")
+    parser.add_argument("--long", action="store_true", help="commands that take minutes too")
     parser.add_argument("--against", metavar="TREE", help="time `discover` of another working tree in turn")
     parser.add_argument("--only", default="", help="rows in whose name or group this stands")
     parser.add_argument("--no-write", action="store_true", help="only print")
