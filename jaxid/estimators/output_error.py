@@ -41,7 +41,7 @@ from jaxid.estimators.simulated_output import (
 )
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.model.unknowns import REFERENCE
+from jaxid.model.unknowns import REFERENCE, in_loop
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
@@ -59,6 +59,10 @@ from jaxid.simulation.sensor_noise import position_noise
 _CLEARLY = 10.0
 # Noise is no news that moves no estimate by this many standard deviations, nor widens one by this factor.
 _LITTLE, _SLIGHTLY = 0.1, 1.1
+_BEGUN_ELSEWHERE = (
+    "the simulated loop diverged at the first values, so that the fit began at those of a simulation in open "
+    "loop, in segments of the log"
+)
 
 
 def output_error(
@@ -162,7 +166,10 @@ def output_error_steps(
         # With a wrong reference the machine's parameters would diverge: fit the reference's unknowns first.
         end = yield from fit.steps(theta, active=_of_course(machine, fit.active))
         theta = end.theta
-    end = yield from fit.steps(theta)
+    end, notes = (yield from fit.steps(theta)), []
+    if end.diverged and numerics is None and (begun := (yield from _along_segments(fit, theta))) is not None:
+        fit = replace(fit, machine=machine.with_estimate(begun))
+        end, notes = (yield from fit.steps(begun)), [_BEGUN_ELSEWHERE]
     while numerics is None and any(o.forgets(end.theta) for o in fit.outputs):
         # Beyond the past commands that are kept a longer delay has no effect: keep more, and go on.
         fit = fit.changed([o.with_longer_delay() for o in fit.outputs])
@@ -171,7 +178,25 @@ def output_error_steps(
         fit = yield from _on_both(fit, end)
         end = yield from fit.steps(end.theta, end.starts)
     fit, end = yield from _with_starts(fit, end)
-    return (yield from _estimate(fit, end, hessian, profile, command_noise))
+    result = yield from _estimate(fit, end, hessian, profile, command_noise)
+    return replace(result, notes=(*result.notes, *notes))
+
+
+def _along_segments(fit: OutputFit, theta: np.ndarray) -> Steps[np.ndarray | None]:
+    """Fit the logs in open loop from some values, and return what was found; None if that cannot be done.
+
+    Forces may give a small inertia with such an error that its sampled loop is unstable. Without the loop
+    the logged force drives the simulation, in segments that restart from the log, so that it stays near the
+    log at such values too.
+    """
+    unknown_loop = any(in_loop(path) for path, _ in fit.machine.parameters.places)
+    if fit.unforced or unknown_loop or not all(o.looped for o in fit.outputs):
+        return None
+    machine = replace(fit.machine, controller=None)
+    parts = [replace(o.part, machine=replace(o.part.machine, controller=None)) for o in fit.outputs]
+    fitted = parts if len(parts) > 1 else parts[0].log
+    found = yield from output_error_steps(machine, fitted, start=theta)
+    return found.theta if found.converged and np.all(np.isfinite(found.theta)) else None
 
 
 def _outputs(

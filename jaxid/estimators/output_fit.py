@@ -212,6 +212,11 @@ class FitEnd:
     failure: str
     steps: int
 
+    @property
+    def diverged(self) -> bool:
+        """True if the simulation diverges where the fit ended, or its derivatives grow without bound."""
+        return not (np.isfinite(self.cost) and all(_bounded(log.jacobian) for log in self.logs))
+
 
 @dataclass(frozen=True)
 class OutputFit:
@@ -301,8 +306,10 @@ class OutputFit:
         jacobian = np.asarray(minimum.jacobian).reshape(*e.shape, -1)
         p, values = self.unknowns, np.asarray(minimum.theta)
         rows = [Rows(jacobian, e, output.counts, output.signal)]
-        failure = _failure(minimum, self.minimiser)
-        ended = (np.ones(1), bool(minimum.converged), failure, int(minimum.steps))
+        # A loop between the limits of its force may stay near the log although it is unstable.
+        bounded = _bounded(jacobian)
+        failure = _failure(minimum, self.minimiser) if bounded else _DIVERGED
+        ended = (np.ones(1), bool(minimum.converged) and bounded, failure, int(minimum.steps))
         return FitEnd(values[:p], values[p:], theta, float(minimum.cost), rows, *ended)
 
     def _together(
@@ -403,6 +410,12 @@ def _pooled(logs: Sequence[Rows]) -> np.ndarray:
     """Return one over the mean square of all residuals, as the weight of each log."""
     squares = sum(float(np.sum(np.square(log.residual))) for log in logs)
     return np.full(len(logs), sum(int(log.counts.sum()) for log in logs) / max(squares, 1e-300))
+
+
+def _bounded(jacobian: np.ndarray) -> bool:
+    """Check that the squares of derivatives are finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(np.sum(np.square(jacobian))))
 
 
 def _failure(minimum: Minimum, minimiser: str | Minimiser | None) -> str:

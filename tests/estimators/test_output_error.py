@@ -1,5 +1,7 @@
 """Output error on position, on force, or on both: one loop, one fit, its precision, and what is refused."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -35,6 +37,18 @@ def test_truth_is_recovered(fits, on):
     np.testing.assert_allclose(estimate.theta, TRUTH, rtol=6e-3)
     # Sigmas are those of a loop that feeds the noise back, which the simulated one does not.
     assert np.all(np.abs(estimate.theta - TRUTH) < 6 * estimate.std)
+
+
+@pytest.mark.parametrize("limit", ["", "limit = 10.0\n"], ids=["no limit", "between limits"])
+def test_a_loop_that_diverges_at_the_first_values(files, tmp_path, limit):
+    """A hundredth of the inertia makes the sampled loop unstable; the logged force leads back."""
+    case, log = files
+    said = re.sub(r"inertia = .*", "inertia = { guess = 1.0 }", case.read_text())
+    said = said.replace("limit = 10.0\n", limit) + '[output_error]\nstart = "guess"\n'
+    estimate = jaxid.identify(write_case(tmp_path, said), log, method="output_error").estimate
+    assert estimate.converged
+    assert any("diverged at the first values" in note for note in estimate.notes)
+    np.testing.assert_allclose(estimate.theta, TRUTH, rtol=6e-3)
 
 
 def test_each_compares_what_it_says(files, fits):
