@@ -17,7 +17,7 @@ _THIN = 1e-9
 # Radius of gyration of a body of which nothing is known, over the distance between its joints, and least mass
 # of one over the largest.
 _SPREAD, _LIGHT = 0.3, 1e-2
-# Shortest distance between joints, over the reach of the arm, and reach of one whose joints meet in a point [m].
+# Shortest distance between joints, over the reach of the arm, and reach of one without a length [m].
 _SHORT, _POINT = 0.3, 0.3
 # Weights of the distance from the first bodies, beside the squares of relative differences of the sums.
 _WEIGHTS = 10.0 ** -np.arange(0, 13, 2)
