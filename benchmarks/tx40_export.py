@@ -34,9 +34,9 @@ from jaxid.simulation.force_balance import ForceData
 ROOT = Path(__file__).parents[1]
 HERE = Path(__file__).parent / "results"
 STATES = 1000
-# MuJoCo's dry friction opposes v + a times a time step of the file, 1 ms: above this velocity [rad/s] the
-# accelerations of the log do not turn its sign.
-CLEAR = 0.05
+# MuJoCo's dry friction opposes v + a times half its time constant (two time steps of the file) times its
+# largest impedance [s]; below this velocity [rad/s] it may be less.
+AHEAD, CLEAR = 0.9999 * 0.001, 0.02
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Torques:
         rigid: Largest difference of torques by bodies, rotors and shaft over the largest torque of its joint:
             on random states, and along the last third.
         smooth: The same with viscous friction.
-        dry: Share of the samples of the last third at which MuJoCo's dry friction is jaxid's, by joint, to
-            1e-9 of the largest; samples at which the joint and its shaft turn faster than `CLEAR`.
+        dry: Share of the samples of the last third at which MuJoCo's dry friction is jaxid's one time step
+            later, by joint, to 1e-9 of the largest; samples at which joint and shaft are faster than `CLEAR`.
         counted: Share of such samples, by joint.
         measured: RMS of the measured torque on the last third, by joint [N m].
         ours, theirs: RMS of what jaxid and MuJoCo leave of it [N m].
@@ -95,10 +95,11 @@ def torques(found: Identification, file: ExportedFile) -> Torques:
     torque, dry = inverse(model, log)
     # jaxid's sign of the velocity is a tanh, here far narrower than any velocity.
     sharp = plant.smoothed(sharpness=jnp.asarray(1e-12), velocity_scale=jnp.ones(plant.joints))
-    signs = of_effects(sharp, log, "coulomb_friction") - of_effects(plant, log)
-    alike, clear = np.abs(dry - signs) < 1e-9 * np.abs(signs).max(axis=0), np.abs(data.qd) > CLEAR
+    later = np.stack([data.q, data.qd + AHEAD * data.qdd, data.qdd])
+    signs = of_effects(sharp, later, "coulomb_friction") - of_effects(plant, later)
+    alike, clear = np.abs(dry - signs) < 1e-9 * np.abs(signs).max(axis=0), np.abs(later[1]) > CLEAR
     for ratios in plant.shafts:
-        clear &= (np.abs(data.qd @ ratios) > CLEAR)[:, None] | (np.array(ratios) == 0.0)
+        clear &= (np.abs(later[1] @ ratios) > CLEAR)[:, None] | (np.array(ratios) == 0.0)
     share = (alike & clear).sum(axis=0) / clear.sum(axis=0)
 
     # What MuJoCo leaves of the measured torque, in the pass band and at the samples that count in jaxid.
@@ -154,7 +155,7 @@ def page(found: Identification, compared: Torques, file: ExportedFile, replay: s
         row("left by jaxid, % of the torque: fitted part", percent(fit.force.relative)),
         row("last third", percent(compared.ours / compared.measured)),
         row(f"samples above {CLEAR} rad/s, %", percent(compared.counted)),
-        row("at which MuJoCo's frictionloss is jaxid's dry friction, %", percent(compared.dry)),
+        row("at which MuJoCo's frictionloss is jaxid's a time step later, %", percent(compared.dry)),
         "",
         "Torques of MuJoCo less those of jaxid, largest over the largest torque of the joint, on",
         f"{STATES} random states and along the last third:",

@@ -167,7 +167,7 @@ def test_cubic_spring_and_offset_are_found_in_silverbox(silverbox):
     assert after["multisine"] <= 0.33
 
 
-# Torque left on the last third by the published least squares of base parameters, which may be no bodies, in %
+# Torque left on the last third by least squares of base parameters, which may be no bodies, in %
 # of its RMS; docs/evidence/tx40.md has them.
 TX40_SUMS = (6.8, 5.3, 7.6, 8.8, 37.1, 19.9)
 
