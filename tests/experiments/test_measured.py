@@ -176,7 +176,7 @@ TX40_SUMS = (6.8, 5.3, 7.6, 8.8, 37.1, 19.9)
 @pytest.mark.slow
 def test_an_arm_without_a_file_is_an_mjcf_with_its_torques(tmp_path):
     from benchmarks.tx40_export import fitted, torques
-    from jaxid.commands.export import export
+    from jaxid.commands.export import check_export, export
 
     found = fitted(tmp_path)
     file = export(tmp_path / "out" / "result.json", "mjcf", name="tx40")
@@ -189,3 +189,7 @@ def test_an_arm_without_a_file_is_an_mjcf_with_its_torques(tmp_path):
     left = 100 * compared.ours / compared.measured
     assert np.all(left < np.array(TX40_SUMS) + [0, 0.2, 0, 0, 0, 0]), left
     assert np.all(compared.theirs < 1.05 * compared.ours)
+    replay = check_export(tmp_path / "out" / "result.json", "mjcf", file, tmp_path / "last_third.csv")
+    assert replay.before is None
+    assert replay.difference.max() < 1e-3
+    assert "your file" not in str(replay)
