@@ -11,6 +11,7 @@ each joint alone; what is left at the last two joints is the friction of the sha
 from __future__ import annotations
 
 import os
+import re
 import sys
 import time
 from pathlib import Path
@@ -47,6 +48,12 @@ level = { guess = [1.0, 1.0, 1.0, 1.0, 1.0, 1.0] }
 kind = "constant_force"
 level = { guess = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] }
 """
+# Links of which all is unknown, from balls on.
+BALL = """mass = { guess = 4.0 }
+first_moment = { guess = [0.0, 0.0, 0.0] }
+inertia = { guess = [0.04, 0.0, 0.0, 0.04, 0.0, 0.04] }
+"""
+CAN_EXIST = "[identification]\nphysically_consistent = true\n\n[log]"
 # Beyond, the arm differs from its model by the edges of dry friction, and a search would first mend those.
 # The joints swing below 3 Hz.
 SLOW = "[preprocess]\ncutoff_hz = 15.0\n\n[log]"
@@ -80,6 +87,13 @@ def without_shaft(text: str) -> str:
     return "[[effects]]".join([head, *kept]) + "# What is logged" + measured
 
 
+def with_bodies(text: str) -> str:
+    """Return the case with links that bodies can be, all ten parameters unknown."""
+    links, count = re.subn(r"mass = .*\nfirst_moment = .*\ninertia = .*\n", BALL, text)
+    assert count == JOINTS, "the case states a mass, a first moment and an inertia of each link"
+    return links.replace("[log]", CAN_EXIST, 1)
+
+
 def models(folder: Path) -> None:
     """Torque left over, by joint, on both parts of the log; friction beside what is published."""
     start = time.perf_counter()
@@ -91,8 +105,14 @@ def models(folder: Path) -> None:
     cell = lambda gaps, k: ", ".join(f"{100 * g.force.relative[k]:.1f}" for g in gaps)
     (folder / "tx40_alone.toml").write_text(ALONE + whole[whole.index("# What is logged") :])
     (folder / "tx40_joints.toml").write_text(without_shaft(whole))
-    names = ("each joint alone", "arm, friction of joints", "arm, and of the shaft")
-    for name, what in zip(("tx40_alone", "tx40_joints", "tx40"), names, strict=True):
+    (folder / "tx40_bodies.toml").write_text(with_bodies(whole))
+    names = {
+        "tx40_alone": "each joint alone",
+        "tx40_joints": "arm, friction of joints",
+        "tx40_bodies": "arm of bodies that can exist, and of the shaft",
+        "tx40": "arm, and of the shaft",
+    }
+    for name, what in names.items():
         found = jaxid.identify(folder / f"{name}.toml", log, method="inverse_dynamics")
         found.save(folder / name, overwrite=True)
         table.row(what, *[cell(found.gaps, k) for k in range(JOINTS)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -93,26 +93,9 @@ def bodies_of(
     if are_bodies(found):
         return Bodies(found, own, 0.0)
 
-    sums = _sums_of(plant)
-    columns = [k for k, (name, _) in enumerate(sums.standard) if name in TEN]
-    turning = [k for k, (name, _) in enumerate(sums.standard) if name not in TEN]
-    alone = [_alone(sums, c) for c in turning]
-    final = np.where(alone, own, rotors) if turning else own
-    mapping = sums.mapping[:, columns]
-    kinds = np.array([TEN.index(sums.standard[c][0]) for c in columns])
-    links = np.array([sums.standard[c][1] for c in columns])
-    wanted = mapping @ found[links, kinds] + sums.mapping[:, turning] @ (own - final)[: len(turning)]
-
-    # A row counts by the size of its sum over the magnitudes of the file's bodies; one that is next to
-    # nothing, such as the product of inertia of a symmetric link, by a part of the largest of its kind.
-    size = np.abs(mapping) @ np.abs(start[links, kinds]) + np.abs(wanted)
-    dimension = np.digitize(kinds[np.argmax(mapping != 0, axis=1)], [1, 4])
-    largest = np.array([size[dimension == d].max() for d in dimension])
-    size = np.maximum(size, _SMALL * largest)
-    heavy = np.flatnonzero(start[:, 0] > 0)
-    asked = _Asked(*map(jnp.asarray, (start, heavy, mapping, links, kinds, wanted, size)))
-
-    x = np.asarray(jax.vmap(log_cholesky)(jnp.asarray(_fuller(start[heavy])))).ravel()
+    asked, final = LinkSums.of(plant, start, rotors)
+    x = np.asarray(jax.vmap(log_cholesky)(jnp.asarray(fuller(start[asked.heavy])))).ravel()
+    asked = LinkSums(*map(jnp.asarray, asked))
     error = np.asarray(_rest(x, asked))
     for _ in range(_STEPS):
         if np.abs(error).max() < _CLOSE:
@@ -129,8 +112,8 @@ def bodies_of(
     return Bodies(out, final, float(np.abs(error).max()))
 
 
-class _Asked(NamedTuple):
-    """The sums that bodies are to have, as arrays of a compiled function.
+class LinkSums(NamedTuple):
+    """Sums that bodies are to have.
 
     Args:
         start: Links of the file; heavy: indices of those that have mass.
@@ -138,23 +121,56 @@ class _Asked(NamedTuple):
         wanted, size: The sums, and the size by which each counts.
     """
 
-    start: Array
-    heavy: Array
-    mapping: Array
-    links: Array
-    kinds: Array
-    wanted: Array
-    size: Array
+    start: Any
+    heavy: Any
+    mapping: Any
+    links: Any
+    kinds: Any
+    wanted: Any
+    size: Any
+
+    @classmethod
+    def of(
+        cls, plant: LinkTree, start: Float[np.ndarray, "links 10"], rotors: Float[np.ndarray, " n"]
+    ) -> tuple[LinkSums, Float[np.ndarray, " n"]]:
+        """Return the sums of a plant that its links have, and its rotors.
+
+        A rotor that is part of a sum is that of the file, and the links have the rest of the sum.
+
+        Args:
+            plant: The plant, its rotors as seen at the joints.
+            start: Links of the file.
+            rotors: Rotors of the file.
+        """
+        found, sums = links_of(plant), _sums_of(plant)
+        own = np.zeros(plant.joints) if plant.rotor_inertia is None else np.asarray(plant.rotor_inertia)
+        columns = [k for k, (name, _) in enumerate(sums.standard) if name in TEN]
+        turning = [k for k, (name, _) in enumerate(sums.standard) if name not in TEN]
+        alone = [_alone(sums, c) for c in turning]
+        final = np.where(alone, own, rotors) if turning else own
+        mapping = sums.mapping[:, columns]
+        kinds = np.array([TEN.index(sums.standard[c][0]) for c in columns])
+        links = np.array([sums.standard[c][1] for c in columns])
+        wanted = mapping @ found[links, kinds] + sums.mapping[:, turning] @ (own - final)[: len(turning)]
+
+        # A row counts by the size of its sum over the magnitudes of the file's bodies; one that is next to
+        # nothing, such as the product of inertia of a symmetric link, by a part of the largest of its kind.
+        size = np.abs(mapping) @ np.abs(start[links, kinds]) + np.abs(wanted)
+        dimension = np.digitize(kinds[np.argmax(mapping != 0, axis=1)], [1, 4])
+        largest = np.array([size[dimension == d].max() for d in dimension])
+        size = np.maximum(size, _SMALL * largest)
+        heavy = np.flatnonzero(start[:, 0] > 0)
+        return cls(start, heavy, mapping, links, kinds, wanted, size), final
 
 
-def _links(x: Array, asked: _Asked) -> Array:
+def _links(x: Array, asked: LinkSums) -> Array:
     """Return all links from the coordinates of those that have mass."""
     heavy = jax.vmap(of_log_cholesky)(x.reshape(-1, 10))
     return jnp.asarray(asked.start).at[asked.heavy].set(heavy)
 
 
 @jax.jit
-def _rest(x: Array, asked: _Asked) -> Array:
+def _rest(x: Array, asked: LinkSums) -> Array:
     """Return the sums of bodies less those that are asked for, relative to their sizes."""
     return (asked.mapping @ _links(x, asked)[asked.links, asked.kinds] - asked.wanted) / asked.size
 
@@ -175,7 +191,7 @@ def _sums_of(plant: LinkTree) -> BaseParameters:
     return base_parameters(plant)
 
 
-def _fuller(ten: Float[np.ndarray, "links 10"]) -> Float[np.ndarray, "links 10"]:
+def fuller(ten: Float[np.ndarray, "links 10"]) -> Float[np.ndarray, "links 10"]:
     """Return bodies with some extent in every direction, which have such coordinates."""
     out = ten.copy()
     for body in out:

@@ -20,12 +20,15 @@ def add(commands: Commands) -> None:
     """Add the command and its arguments."""
     purpose = "put the values of a result into the robot's file, or into one of another program"
     parser = add_command(commands, "export", purpose, run, examples=_EXAMPLES)
-    parser.add_argument("result", metavar="RESULT.json", help="result.json or discovery.json of a tree")
+    parser.add_argument(
+        "result", metavar="RESULT.json", help="result.json or discovery.json of an arm or tree"
+    )
     parser.add_argument("--to", metavar="TARGET", required=True, help=f"one of {', '.join(TARGETS)}")
     parser.add_argument(
         "--model",
         metavar="ROBOT.xml",
-        help="for mjcf and urdf, the file that the case names; default: the path in the case",
+        help="for mjcf and urdf, the file that the case names; default: the path in the case, or a new "
+        "file if it names none",
     )
     parser.add_argument("-o", metavar="FILE", required=True, help="file to write")
     parser.add_argument(
@@ -73,7 +76,10 @@ def run(args: argparse.Namespace) -> int:
 
     lines = [f"not exported: {note}" for note in exported.notes]
     changed = ", ".join(exported.changed) or "nothing"
-    lines.append(f"{'changed' if args.to in ('mjcf', 'urdf') else 'wrote'} {changed} in {path}")
+    own = args.to in ("mjcf", "urdf")
+    if exported.new:
+        lines.append(f"the case names no {args.to.upper()} to change: a new one is written")
+    lines.append(f"{'changed' if own and not exported.new else 'wrote'} {changed} in {path}")
     if drawn is not None:
         lines.append(f"drew {count} models, {drawn_paths[0].name} to {drawn_paths[-1].name}; {drawn}")
     if checked is not None:

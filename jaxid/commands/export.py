@@ -30,11 +30,12 @@ def export(
         result: result.json or discovery.json, or its content.
         to: One of `jaxid.names.TARGETS`.
         model: For "mjcf" and "urdf" the file that the case names: its text is kept, and single values are
-            changed. None: the path that the case states. The other targets need none.
+            changed. None: the path that the case states; a file of its own if the case names none, as that
+            of an arm by Denavit-Hartenberg parameters. The other targets need none.
         name: Name of the machine in files that have one: the stem of the file that is written.
 
     Raises:
-        InputError: If the result is of no robot from a file, or the model is not that of its case.
+        InputError: If the result is of no arm or tree of links, or the model is not that of its case.
     """
     if to not in TARGETS:
         hint = suggest(to, TARGETS) if isinstance(to, str) else f"choose one of {', '.join(TARGETS)}"
@@ -42,6 +43,12 @@ def export(
     machine, where = machine_of(result)
     if to in _OWN_FILES:
         path = Path(model) if model is not None else _named_file(machine, to, where)
+        if path is None:
+            if to == "urdf":
+                from jaxid.export.new_urdf import new_urdf as new
+            else:
+                from jaxid.export.new_mjcf import new_mjcf as new
+            return new(machine, name, version("jaxid"), where)
         if to == "urdf":
             from jaxid.export.urdf import export_urdf
 
@@ -86,7 +93,7 @@ def check_export(
 
     machine, where = machine_of(result)
     path = Path(model) if model is not None else _named_file(machine, to, where)
-    return replay_export(machine, exported, path, log, where)
+    return replay_export(machine, exported, path, log, where, to)
 
 
 def draw_exports(
@@ -129,12 +136,12 @@ def machine_of(result: Mapping[str, Any] | str | Path) -> tuple[Mapping[str, Any
     """Return `model` of a result, and the result's name for messages.
 
     Raises:
-        InputError: If it cannot be read, or is of no robot from a file.
+        InputError: If it cannot be read, or is of no arm or tree of links.
     """
     where = "result" if isinstance(result, Mapping) else str(result)
     machine = content_of(result).get("model")
     if not isinstance(machine, Mapping):
-        hint = 'give a result.json or discovery.json of a case with kind = "tree"'
+        hint = 'give a result.json or discovery.json of a case with kind = "tree" or "serial_arm"'
         raise InputError("has no robot to export", where=where, hint=hint)
     return machine, where
 
@@ -158,18 +165,20 @@ def content_of(result: Mapping[str, Any] | str | Path) -> Mapping[str, Any]:
     return content if isinstance(content, Mapping) else {}
 
 
-def _named_file(machine: Mapping[str, Any], to: str, where: str) -> Path:
-    """Return the robot's file as the case of a result names it.
+def _named_file(machine: Mapping[str, Any], to: str, where: str) -> Path | None:
+    """Return the robot's file as the case of a result names it; None if there is none to name.
 
     Raises:
         InputError: If the result does not say, or the file is not there.
     """
-    case = machine.get("case", {})
-    given = case.get("tables", {}).get("plant", {}).get(_OWN_FILES[to])
+    case = machine.get("case")
+    given = (case or {}).get("tables", {}).get("plant", {}).get(_OWN_FILES[to])
     if given is None:
+        if case is not None or not machine.get("of_file", True):
+            return None
         what = f"does not say which {to.upper()} it belongs to"
         raise InputError(what, where=where, hint="name the file of the case by --model")
-    path = Path(case["folder"]) / given
+    path = Path((case or {})["folder"]) / given
     if not path.is_file():
         hint = "run it in the folder in which identify ran, or name the file by --model"
         raise InputError(f"its case names {path}, which is not here", where=where, hint=hint)

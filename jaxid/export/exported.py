@@ -28,6 +28,7 @@ class ExportedFile:
         lost: Effects among them, by their numbers in `model.effects` of the result, from 0.
         real: Whether every body that was found can exist, and was written.
         added: Names of joints that the user's file does not have.
+        new: Whether it is a robot's file of its own, where the case names none to change.
     """
 
     content: bytes
@@ -36,12 +37,14 @@ class ExportedFile:
     lost: tuple[int, ...] = ()
     real: bool = True
     added: tuple[str, ...] = ()
+    new: bool = False
 
 
 def shown(effect: Mapping[str, Any]) -> str:
     """Return an effect of a result in words: kind, joint and values."""
     values = ", ".join(f"{n} = {v:.6g}" for n, v in effect["parameters"].items() if v is not None)
     place = f"[{effect['joint_name']}]" if "joint_name" in effect else ""
+    place = f"[shaft {effect['shaft']}]" if "shaft" in effect else place
     return f"{effect['kind']}{place} ({values})"
 
 
@@ -64,13 +67,20 @@ class JointLaws:
     lost: tuple[int, ...]
 
     @classmethod
-    def of(cls, model: Mapping[str, Any], placed: Mapping[str, str], stay: Collection[str]) -> JointLaws:
+    def of(
+        cls,
+        model: Mapping[str, Any],
+        placed: Mapping[str, str],
+        stay: Collection[str],
+        held: Collection[int] = (),
+    ) -> JointLaws:
         """Sort the effects of a result.
 
         Args:
             model: `model` of result.json.
             placed: Kinds that the file can hold at a joint, with their parameter.
             stay: Kinds that are dealt with elsewhere.
+            held: Numbers of effects that are.
         """
         values: list[dict[str, float]] = [{} for _ in model["joints"]]
         lost = []
@@ -79,7 +89,7 @@ class JointLaws:
             value = effect["parameters"].get(placed.get(kind, ""))
             if value is not None and joint >= 0:
                 values[joint][kind] = values[joint].get(kind, 0.0) + float(value)
-            elif kind not in stay and not is_nothing(effect):
+            elif kind not in stay and number not in held and not is_nothing(effect):
                 lost.append(number)
         return cls(tuple(values), tuple(lost))
 
@@ -115,3 +125,12 @@ def rotors_of(model: Mapping[str, Any]) -> np.ndarray | None:
     if rotors is None:
         return None
     return np.asarray(rotors) * (1.0 if ratios is None else np.asarray(ratios) ** 2)
+
+
+def transmission_notes(model: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a sentence on the gears between the motors of the log and the joints; nothing without them."""
+    if not (model.get("drives") or {}).get("transmission"):
+        return ()
+    return (
+        "the transmission of the case: commands are forces of the joints, and the log's are of the motors",
+    )

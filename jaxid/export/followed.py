@@ -35,9 +35,9 @@ class Followed:
         log: The log.
         replay: Its inputs.
         own: Position that jaxid simulates, (time, n) [m or rad].
-        users: The user's file in MuJoCo.
+        users: The user's file in MuJoCo; None: there is none.
         robot: The exported file in MuJoCo.
-        before: Position of the user's file, (time, n).
+        before: Position of the user's file, (time, n); None without it.
         after: Position of the exported file, (time, n).
     """
 
@@ -45,30 +45,30 @@ class Followed:
     log: Log
     replay: Replay
     own: Float[np.ndarray, "time n"]
-    users: MujocoRobot
+    users: MujocoRobot | None
     robot: MujocoRobot
-    before: Float[np.ndarray, "time n"]
+    before: Float[np.ndarray, "time n"] | None
     after: Float[np.ndarray, "time n"]
 
     @classmethod
-    def of(cls, machine: Machine, log: Log, users: MujocoRobot, robot: MujocoRobot) -> Followed:
+    def of(cls, machine: Machine, log: Log, users: MujocoRobot | None, robot: MujocoRobot) -> Followed:
         """Follow a log.
 
         Args:
             machine: Machine of the result.
             log: The log.
-            users: The user's file in MuJoCo.
+            users: The user's file in MuJoCo; None: there is none.
             robot: The exported file in MuJoCo.
 
         Raises:
             InputError: If a simulation cannot run, or diverges.
         """
         replay, own = _simulated(machine, log)
-        before, after = users.motion(replay), robot.motion(replay)
+        before, after = None if users is None else users.motion(replay), robot.motion(replay)
         for what, values in (("the exported file", after), ("your file", before)):
-            if not np.all(np.isfinite(values)):
+            if values is not None and not np.all(np.isfinite(values)):
                 what = f"MuJoCo's simulation of {what} diverges on {log.source}"
-                raise InputError(what, where=users.robot.file)
+                raise InputError(what, where=robot.robot.file)
         return cls(machine, log, replay, own, users, robot, before, after)
 
     def lacks(self, model: Mapping[str, Any], exported: ExportedFile) -> Iterator[tuple[str, np.ndarray]]:
@@ -97,13 +97,16 @@ class Followed:
 
     def _creep(self) -> Iterator[tuple[str, np.ndarray]]:
         """Return what creep of MuJoCo's dry friction moves: that of the user's softness, and what is left."""
-        ours, theirs = self.robot.softness, self.users.model
+        ours = self.robot.softness
         if not ours:
             return
-        kept = {name: Softness.of(theirs, int(theirs.joint(name).dofadr[0])) for name in ours}
+        kept, whose = dict.fromkeys(ours, Softness.usual()), "MuJoCo's usual dry friction"
+        if self.users is not None:
+            theirs, whose = self.users.model, "your file's dry friction"
+            kept = {name: Softness.of(theirs, int(theirs.joint(name).dofadr[0])) for name in ours}
         if any(kept[name].softer(softness) for name, softness in ours.items()):
             moved = self.robot.motion(self.replay, Setting(softness=kept))
-            yield "creep of your file's dry friction (solreffriction)", rms(moved - self.after)
+            yield f"creep of {whose} (solreffriction)", rms(moved - self.after)
         # None can be stiffer; what a little creep moves is in proportion to it.
         least = Softness.least(float(self.robot.model.opt.timestep))
         soft = any(softness.softer(least) for softness in ours.values())

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jaxid.export.exported import is_nothing, shown
+from jaxid.export.exported import is_nothing, shown, transmission_notes
 
 # Force that a drive needs to overcome an effect: position q, velocity v, acceleration a, gravity g.
 _FORMULAS = {
@@ -64,11 +64,26 @@ class Language:
         text += self.suffix
         return f"({text})" if value < 0 else text
 
-    def formula(self, template: str, values: Mapping[str, float], joint: int) -> str:
-        """Return a formula with its numbers, in the motion of a joint."""
-        text = _MOTION.sub(rf"\1[{joint}]", template)
+    def formula(self, template: str, values: Mapping[str, float], place: Mapping[int, float]) -> str:
+        """Return a formula with its numbers, in the motion of a joint or of a shaft.
+
+        Args:
+            template: The formula.
+            values: Its numbers.
+            place: How much the joint or shaft turns with each joint, from 0.
+        """
+        text = _MOTION.sub(lambda match: self._turn(match[1], place), template)
         text = text.format_map({name: self.number(value) for name, value in values.items()})
         return _WORD.sub(lambda match: f"{self.functions[match[1]]}(", text)
+
+    def _turn(self, motion: str, place: Mapping[int, float]) -> str:
+        """Return the motion of a joint or a shaft."""
+        parts = [self.share(ratio, f"{motion}[{joint}]") for joint, ratio in place.items()]
+        return parts[0] if len(parts) == 1 else f"({' + '.join(parts)})"
+
+    def share(self, ratio: float, text: str) -> str:
+        """Return a multiple of a term."""
+        return text if ratio == 1.0 else f"{self.number(ratio)} * {text}"
 
 
 @dataclass(frozen=True)
@@ -99,26 +114,40 @@ def written(model: Mapping[str, Any], language: Language, field: float) -> Writt
     count = len(model["joints"])
     forces: list[list[str]] = [[] for _ in range(count)]
     commands: list[list[str]] = [[] for _ in range(count)]
-    notes, lost = [], []
+    notes, lost = list(transmission_notes(model)), []
     for number, effect in enumerate(model["effects"]):
         if is_nothing(effect):
             continue
-        kind, joint = effect["kind"], effect.get("joint", 0) - 1
+        kind, place = effect["kind"], _place(model, effect)
         values = {"g": field, **{n: v for n, v in effect["parameters"].items() if v is not None}}
         if "period" in values:
             values["wave"] = 2 * 3.141592653589793 / values["period"]
-        into = forces if kind in _FORMULAS else commands
         template = _FORMULAS.get(kind, _DRIVES.get(kind))
         remark = _REMARKS.get(kind, "is left out" if template is None else "")
-        fits = template is not None and joint >= 0 and _names(template) <= set(values)
+        fits = template is not None and bool(place) and _names(template) <= set(values)
+        # A drive is one of a joint.
+        fits = fits and (kind in _FORMULAS or len(place) == 1)
         if fits:
             assert template is not None, "it fits"
-            into[joint].append(language.formula(template, values, joint))
+            term = language.formula(template, values, place)
+            for joint, ratio in place.items():
+                if kind in _FORMULAS:
+                    forces[joint].append(term if ratio == 1.0 else language.share(ratio, f"({term})"))
+                else:
+                    commands[joint].append(term)
         if remark or not fits:
             notes.append(f"{shown(effect)} {remark or 'is left out'}")
             lost.append(number)
     # Effects of a drive act one after the other: the last one is undone first.
     return Written(_rows(forces), _rows([steps[::-1] for steps in commands]), tuple(notes), tuple(lost))
+
+
+def _place(model: Mapping[str, Any], effect: Mapping[str, Any]) -> dict[int, float]:
+    """Return how much the place of an effect turns with each joint, from 0; nothing in another place."""
+    if "shaft" in effect:
+        ratios = model["shafts"][effect["shaft"] - 1]
+        return {joint: float(ratio) for joint, ratio in enumerate(ratios) if ratio}
+    return {effect["joint"] - 1: 1.0} if "joint" in effect else {}
 
 
 def _names(template: str) -> set[str]:

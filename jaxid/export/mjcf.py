@@ -18,6 +18,7 @@ from jaxid.errors import InputError
 from jaxid.export.exported import ExportedFile, JointLaws, need_joints, plant_of, shown
 from jaxid.export.mjcf_behind import BEHIND, BehindJoints
 from jaxid.export.mjcf_drives import DRIVE_EFFECTS, DriveText
+from jaxid.export.shaft_tendons import ShaftTendons, insert_tendons
 from jaxid.export.soft_friction import Softness
 from jaxid.export.xml_text import Element, XmlText
 
@@ -26,7 +27,7 @@ _SAME = 1e-12
 # Relative difference of a sum up to which bodies count as those of the result.
 _CLOSE = 1e-6
 # Effects that a joint of an MJCF has, with their parameter.
-_LAWS = {
+JOINT_LAWS = {
     "viscous_friction": "coefficient",
     "quadratic_drag": "coefficient",
     "cubic_friction": "coefficient",
@@ -37,8 +38,8 @@ _LAWS = {
     "cubic_stiffness": "coefficient",
     "added_mass": "mass",
 }
-_DAMPING = ("viscous_friction", "quadratic_drag", "cubic_friction")
-_SPRING = ("constant_force", "linear_stiffness", "quadratic_stiffness", "cubic_stiffness")
+DAMPING = ("viscous_friction", "quadratic_drag", "cubic_friction")
+SPRING = ("constant_force", "linear_stiffness", "quadratic_stiffness", "cubic_stiffness")
 
 
 def export_mjcf(model: Mapping[str, Any], path: Path) -> ExportedFile:
@@ -66,7 +67,8 @@ def export_mjcf(model: Mapping[str, Any], path: Path) -> ExportedFile:
     elements = _elements(text, compiled, mujoco, where)
     drives = DriveText(text, compiled, robot, model, elements.joints, autolimits)
     drives.write()
-    work = _Work(mujoco, compiled, text, elements, robot, model, degrees, drives.damping)
+    shafts = ShaftTendons.of(model, float(compiled.opt.timestep), elements.names)
+    work = _Work(mujoco, compiled, text, elements, robot, model, degrees, drives.damping, shafts)
     file = projected(robot)
     rotors = np.array([file[joint.name].armature for joint in robot.free])
     found = bodies_of(plant_of(robot, model), robot.bodies, rotors)
@@ -74,11 +76,28 @@ def export_mjcf(model: Mapping[str, Any], path: Path) -> ExportedFile:
     work.bodies(found)
     springs = BehindJoints(compiled, text, elements.joints, work.names, model)
     springs.write()
+    insert_tendons(text, (*springs.tendons, *shafts.texts))
     work.notes.extend(springs.notes)
     work.changed.extend(springs.changed)
     changed, notes = (*work.changed, *drives.changed), (*work.notes, *drives.notes)
     lost, added = (*work.lost, *drives.lost), tuple(springs.added)
     return ExportedFile(text.text(), changed, notes, lost, work.real, added)
+
+
+def spring_of(force: Float[np.ndarray, " 4"]) -> tuple[float, list[float]] | None:
+    """Return rest and stiffness of a spring of an MJCF; None if it has no rest towards which it pulls.
+
+    Args:
+        force: Factors of 1, q, q^2 and q^3 in the force against the coordinate q.
+    """
+    own = np.polynomial.Polynomial(force)
+    roots: Any = own.trim().roots() if own.trim().degree() > 0 else np.array([])
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    if not real.size or own.deriv()(real[np.argmin(np.abs(real))]) < 0:
+        return None
+    rest = float(real[np.argmin(np.abs(real))])
+    _, *slopes = [float(c) for c in own(np.polynomial.Polynomial([rest, 1.0])).coef]
+    return rest, slopes if any(slopes[1:]) else slopes[:1]
 
 
 @dataclass
@@ -87,6 +106,11 @@ class _Elements:
 
     joints: dict[int, Element]
     bodies: dict[int, Element]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the joints that have one in the text."""
+        return [e.attributes["name"] for e in self.joints.values() if "name" in e.attributes]
 
 
 def _elements(text: XmlText, model: Any, mujoco: Any, where: str) -> _Elements:
@@ -141,6 +165,7 @@ class _Work:
     model: Mapping[str, Any]
     degrees: bool
     drag: Mapping[str, float]
+    shafts: ShaftTendons
     notes: list[str] = field(default_factory=list)
     changed: list[str] = field(default_factory=list)
     lost: list[int] = field(default_factory=list)
@@ -171,7 +196,7 @@ class _Work:
 
     def _laws(self) -> tuple[dict[str, float], ...]:
         """Return the effects that a joint of an MJCF has, by joint; name the others."""
-        laws = JointLaws.of(self.model, _LAWS, (*DRIVE_EFFECTS, BEHIND))
+        laws = JointLaws.of(self.model, JOINT_LAWS, (*DRIVE_EFFECTS, BEHIND), self.shafts.held)
         self._lose(laws.lost, "has no place in an MJCF")
         return laws.values
 
@@ -206,7 +231,7 @@ class _Work:
     def _damping(
         self, values: dict[str, str | None], joint: RobotJoint, stated: RobotJoint, law: dict, index: int
     ) -> None:
-        more = [law.get(kind, 0.0) - old for kind, old in zip(_DAMPING, stated.damping, strict=True)]
+        more = [law.get(kind, 0.0) - old for kind, old in zip(DAMPING, stated.damping, strict=True)]
         more[0] += self.drag.get(joint.name, 0.0)
         if all(abs(m) <= _SAME * max(abs(s), 1e-9) for m, s in zip(more, stated.damping, strict=True)):
             return
@@ -221,27 +246,24 @@ class _Work:
     def _spring(
         self, values: dict[str, str | None], joint: RobotJoint, stated: RobotJoint, law: dict, index: int
     ) -> None:
-        found = np.array([law.get(kind, 0.0) for kind in _SPRING]) * [-1.0, 1.0, 1.0, 1.0]
+        found = np.array([law.get(kind, 0.0) for kind in SPRING]) * [-1.0, 1.0, 1.0, 1.0]
         more = found - np.array(stated.spring)
         if np.all(np.abs(more) <= _SAME * np.maximum(np.abs(found), 1e-9)):
             return
-        own = np.polynomial.Polynomial(np.array(joint.spring) + more)
-        roots: Any = own.trim().roots() if own.trim().degree() > 0 else np.array([])
-        real = roots[np.abs(roots.imag) < 1e-9].real
-        if not real.size or own.deriv()(real[np.argmin(np.abs(real))]) < 0:
-            listed = ", ".join(f"{kind} = {law[kind]:.6g}" for kind in _SPRING if kind in law)
+        spring = spring_of(np.array(joint.spring) + more)
+        if spring is None:
+            listed = ", ".join(f"{kind} = {law[kind]:.6g}" for kind in SPRING if kind in law)
             self.notes.append(
                 f"{listed} at joint '{joint.name}': a spring of an MJCF has a rest, and pulls towards it"
             )
             self.lost += [
                 number
                 for number, effect in enumerate(self.model["effects"])
-                if effect["kind"] in _SPRING and effect.get("joint_name") == joint.name
+                if effect["kind"] in SPRING and effect.get("joint_name") == joint.name
             ]
             return
-        rest = float(real[np.argmin(np.abs(real))])
-        _, *slopes = [float(c) for c in own(np.polynomial.Polynomial([rest, 1.0])).coef]
-        values["stiffness"] = " ".join(map(repr, slopes if any(slopes[1:]) else slopes[:1]))
+        rest, slopes = spring
+        values["stiffness"] = " ".join(map(repr, slopes))
         turns = joint.motion == "revolute" and self.degrees
         values["springref"] = repr(float(np.degrees(rest)) if turns else rest)
 

@@ -41,6 +41,7 @@ class BehindJoints:
         names: Names of all joints.
         model: `model` of the result.
         notes: Sentences on what differs; changed: names of joints; added: names of the second ones.
+        tendons: Elements of the springs with a clearance.
     """
 
     compiled: Any
@@ -58,15 +59,6 @@ class BehindJoints:
         for effect in self.model["effects"]:
             if effect["kind"] == BEHIND:
                 self._write(effect)
-        if not self.tendons:
-            return
-        section = next((e for e in self.text.root.children if e.tag == "tendon"), None)
-        if section is not None:
-            for one in self.tendons:
-                self.text.insert_into(section, one)
-            return
-        worldbody = next(e for e in self.text.root.children if e.tag == "worldbody")
-        self.text.insert_before(worldbody, f"<tendon>{''.join(self.tendons)}</tendon>")
 
     def _write(self, effect: Mapping[str, Any]) -> None:
         """Write the second joint of one effect."""

@@ -71,7 +71,9 @@ def mass_matrix(q):
 def acceleration(q, v, forces):
     """Return the acceleration of the joints under forces of their drives; dry friction does not stick."""
     zero = np.zeros(len(JOINTS))
-    matrix = mass_matrix(q) + np.diag(friction(q, v, zero + 1.0) - friction(q, v, zero))
+    rest = friction(q, v, zero)
+    added = np.stack([friction(q, v, unit) - rest for unit in np.eye(len(JOINTS))], axis=1)
+    matrix = mass_matrix(q) + added
     return np.linalg.solve(matrix, forces - torque(q, v, zero))
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.case.case import Case
+from jaxid.effects.actuator import ActuatorGain
 from jaxid.export.exported import ExportedFile
 from jaxid.export.followed import STRETCH, Followed, lacks_table, rms
 from jaxid.export.found_machine import case_of, found_machine
@@ -28,7 +30,7 @@ class Replayed:
     Args:
         joints: Names of the joints.
         units: Unit of each joint's position.
-        before: Measured less simulated position, of the user's file in MuJoCo.
+        before: Measured less simulated position, of the user's file in MuJoCo; None: there is none.
         after: The same of the exported file.
         own: The same of the result in jaxid's simulation.
         difference: Exported file in MuJoCo less jaxid's simulation.
@@ -39,7 +41,7 @@ class Replayed:
 
     joints: tuple[str, ...]
     units: tuple[str, ...]
-    before: Float[np.ndarray, " n"]
+    before: Float[np.ndarray, " n"] | None
     after: Float[np.ndarray, " n"]
     own: Float[np.ndarray, " n"]
     difference: Float[np.ndarray, " n"]
@@ -49,24 +51,38 @@ class Replayed:
 
     @property
     def share(self) -> Float[np.ndarray, " n"]:
-        """Difference as a part of the gap that was closed, by joint; NaN where none was."""
+        """Difference as a part of the gap that was closed, by joint; NaN where none was.
+
+        Where there was no file before, nothing is known of the gap, and all are NaN.
+        """
+        if self.before is None:
+            return np.full(self.own.shape, np.nan)
         closed = self.before - self.own
         return np.divide(self.difference, closed, out=np.full(closed.shape, np.nan), where=closed > 0)
 
     def __str__(self) -> str:
         how = "in the loop" if self.closed else f"open loop, anew from the log every {self.stretch:g} s"
-        heads = ["joint", "your file", "exported", "jaxid", "exported - jaxid", "of the gap closed"]
+        heads = ["joint", "exported", "jaxid", "exported - jaxid"]
+        columns = [self.after, self.own, self.difference]
+        if self.before is not None:
+            heads, columns = [heads[0], "your file", *heads[1:], "of the gap closed"], [self.before, *columns]
         rows = [heads]
         for k, name in enumerate(self.joints):
-            share = "-" if np.isnan(self.share[k]) else f"{100 * self.share[k]:.2g} %"
-            sizes = (x[k] for x in (self.before, self.after, self.own, self.difference))
-            rows.append([f"{name} [{self.units[k]}]", *(f"{x:.3g}" for x in sizes), share])
+            row = [f"{name} [{self.units[k]}]", *(f"{x[k]:.3g}" for x in columns)]
+            if self.before is not None:
+                row.append("-" if np.isnan(self.share[k]) else f"{100 * self.share[k]:.2g} %")
+            rows.append(row)
         lines = [f"replay by MuJoCo, {how}: RMS from the log, by joint", aligned(rows), ""]
         return "\n".join([*lines, lacks_table("single causes", self.joints, self.units, self.costs)])
 
 
 def replay_export(
-    model: Mapping[str, Any], exported: ExportedFile, path: Path, log: LogLike, where: str = "result"
+    model: Mapping[str, Any],
+    exported: ExportedFile,
+    path: Path | None,
+    log: LogLike,
+    where: str = "result",
+    to: str = "mjcf",
 ) -> Replayed:
     """Replay a log by the exported file in MuJoCo, and by the result in jaxid.
 
@@ -77,9 +93,10 @@ def replay_export(
     Args:
         model: `model` of result.json.
         exported: The file with the result in it.
-        path: The user's file.
+        path: The user's file; None: there is none.
         log: The log, with the columns of the case.
         where: The result, for messages.
+        to: Target of the file: "mjcf" or "urdf".
 
     Raises:
         InputError: If the result holds no case, the log is unsound, or a simulation cannot run.
@@ -87,15 +104,16 @@ def replay_export(
     case = _alone(case_of(model, where))
     session = open_session(case, log)
     machine = found_machine(model, case, session.machine)
-    shared = (path, model, case, machine)
-    users = mujoco_robot(path.read_bytes(), *shared)
-    ours = mujoco_robot(exported.content, *shared, exported.added)
+    with TemporaryDirectory(prefix="jaxid-") as folder:
+        at = path if path is not None else Path(folder) / f"exported.{'urdf' if to == 'urdf' else 'xml'}"
+        users = None if path is None else mujoco_robot(path.read_bytes(), path, model, case, machine)
+        ours = mujoco_robot(exported.content, at, model, case, machine, exported.added)
     followed = Followed.of(machine, session.fit.log, users, ours)
     measured = followed.log.position
     return Replayed(
         joints=tuple(model["joints"]),
         units=tuple(session.machine.unit("position", k) for k in range(len(model["joints"]))),
-        before=rms(measured - followed.before),
+        before=None if followed.before is None else rms(measured - followed.before),
         after=rms(measured - followed.after),
         own=rms(measured - followed.own),
         difference=rms(followed.after - followed.own),
@@ -130,5 +148,16 @@ def mujoco_robot(
     servo = taken and machine.controller is not None and "controller" not in case.tables
     servo = servo and all(drive is not None and drive.kp is not None for drive in of_file)
     gains = np.array([np.nan if d is None or d.kp is not None else d.gain for d in of_file])
-    driven = bool(taken and not servo and np.allclose(gains, machine.gain, rtol=1e-9))
-    return MujocoRobot(compiled, robot, held, bool(servo), driven, np.asarray(machine.gain), drives)
+    # A file may have the gain of a drive that was found in the gear of its motor.
+    wanted = (np.asarray(machine.gain), np.asarray(machine.gain) * _found_gains(machine, drives))
+    driven = taken and not servo and any(np.allclose(gains, one, rtol=1e-9) for one in wanted)
+    return MujocoRobot(compiled, robot, held, bool(servo), bool(driven), np.asarray(machine.gain), drives)
+
+
+def _found_gains(machine: Machine, drives: tuple[int, ...]) -> Float[np.ndarray, " m"]:
+    """Return the factor of each drive by which its force differs from the declared one."""
+    out = np.ones(len(drives))
+    for effect in machine.plant.effects:
+        if isinstance(effect, ActuatorGain) and effect.port in drives:
+            out[drives.index(effect.port)] *= float(effect.gain)
+    return out

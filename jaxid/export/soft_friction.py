@@ -44,6 +44,15 @@ class Softness:
         """
         return cls((2.0 * step, 1.0), (_HARDEST, _HARDEST))
 
+    @classmethod
+    def usual(cls) -> Softness:
+        """Return that of a file that says nothing of it.
+
+        Source:
+            Defaults of solreffriction and solimpfriction in MuJoCo's XML reference.
+        """
+        return cls((0.02, 1.0), (0.9, 0.95))
+
     @property
     def creep(self) -> float:
         """Velocity under a load, times inertia over load [s]."""

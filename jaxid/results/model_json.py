@@ -1,4 +1,4 @@
-"""The object `model` of results: a robot from a file with all its values, for `export`."""
+"""The object `model` of results: an arm or a tree of links with all its values, for `export`."""
 
 from __future__ import annotations
 
@@ -26,23 +26,27 @@ if TYPE_CHECKING:
 
 
 def model_json(session: Session, estimate: Estimate) -> dict[str, Any]:
-    """Return the object `model` of results: a whole robot from a file, for `export`; else nothing."""
+    """Return the object `model` of results: a whole arm or tree of links, for `export`; else nothing."""
     entry, machine = session.case.plant, estimate.machine
-    if not isinstance(machine.plant, LinkTree) or machine.plant.kind != LinkTree.kind:
+    if not isinstance(machine.plant, LinkTree):
         return {}
     held = session.case.tables["plant"].get("held", {})
     return {
         "model": {
             **robot_json(machine.plant, entry, held),
             "bodies": bodies_json(machine.plant, entry),
-            "drives": drives_json(machine),
+            "drives": drives_json(machine, session.declared),
             **_case_json(session.declared),
         }
     }
 
 
 def robot_json(plant: LinkTree, entry: PlantEntry, held: Mapping[str, float]) -> dict[str, Any]:
-    """Return all values of a robot: its joints and links by name, their frames, parameters, and effects."""
+    """Return all values of a robot: its joints and links by name, their frames, parameters, and effects.
+
+    Joints of an arm that no file describes are called joint1 and so on.
+    """
+    names = entry.names or tuple(f"joint{k + 1}" for k in range(plant.joints))
     values = {name: getattr(plant, name) for name in parameters_of(LinkTree)}
     effects, before = [], replace(plant, effects=())
     for effect in plant.effects:
@@ -52,16 +56,18 @@ def robot_json(plant: LinkTree, entry: PlantEntry, held: Mapping[str, float]) ->
             {
                 "kind": effect.kind,
                 place[0]: place[1],
-                **joint_name(place, entry.names),
+                **joint_name(place, names),
                 "name": effect_name(before, effect),
+                "shafts": [list(ratios) for ratios in plant.shafts],
                 "parameters": {n: None if v is None else float(v) for n, v in numbers.items()},
             }
         )
         before = before.with_effect(effect)
     frames = plant.geometry.at_zero()
     return {
-        "joints": list(entry.names),
-        "links": list(entry.links),
+        "joints": list(names),
+        "links": list(entry.links or names),
+        "of_file": bool(entry.names),
         "held": dict(held),
         "gravity_vector": np.asarray(plant.gravity_vector).tolist(),
         "gear_ratio": None if plant.gear_ratio is None else np.asarray(plant.gear_ratio).tolist(),
@@ -73,6 +79,7 @@ def robot_json(plant: LinkTree, entry: PlantEntry, held: Mapping[str, float]) ->
             "copies": [list(copy) for copy in plant.copies],
             "leading": list(plant.leading),
         },
+        "shafts": [list(ratios) for ratios in plant.shafts],
         "parameters": {n: None if v is None else np.asarray(v).tolist() for n, v in values.items()},
         "effects": effects,
     }
@@ -95,8 +102,12 @@ def bodies_json(plant: LinkTree, entry: PlantEntry) -> dict[str, Any] | None:
     return {**links, "rotor_inertia": found.rotors.tolist(), "error": found.error}
 
 
-def drives_json(machine: Machine) -> dict[str, Any]:
-    """Return the driven joints, from 1, the force of each per unit of its command, and the control law."""
+def drives_json(machine: Machine, declared: Case | None = None) -> dict[str, Any]:
+    """Return the driven joints, from 1, the force of each per unit of its command, and the control law.
+
+    With the case as it was declared also the turns of its motors for one of each joint, if its log is theirs.
+    """
+    rows = None if declared is None else declared.actuator.transmission
     law = machine.controller
     known: dict[str, Any] = {}
     if law is not None:
@@ -109,6 +120,7 @@ def drives_json(machine: Machine) -> dict[str, Any]:
         "joints": [joint + 1 for joint in machine.plant.driven(machine.plant.joints)],
         "gain": np.asarray(machine.gain).tolist(),
         "controller": known or None,
+        **({} if rows is None else {"transmission": [list(row) for row in rows]}),
     }
 
 

@@ -6,6 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jaxid
@@ -164,3 +165,31 @@ def test_cubic_spring_and_offset_are_found_in_silverbox(silverbox):
     assert before["multisine"] == pytest.approx(9.0, abs=0.5)
     assert after["arrow"] <= 0.45
     assert after["multisine"] <= 0.33
+
+
+# Torque left on the last third by least squares of base parameters, which may be no bodies, in %
+# of its RMS; docs/evidence/tx40.md has them.
+TX40_SUMS = (6.8, 5.3, 7.6, 8.8, 37.1, 19.9)
+
+
+@needs_data
+@pytest.mark.slow
+def test_an_arm_without_a_file_is_an_mjcf_with_its_torques(tmp_path):
+    from benchmarks.tx40_export import fitted, torques
+    from jaxid.commands.export import check_export, export
+
+    found = fitted(tmp_path)
+    file = export(tmp_path / "out" / "result.json", "mjcf", name="tx40")
+    assert file.real
+    compared = torques(found, file)
+    assert max(*compared.rigid, *compared.smooth) < 1e-9
+    assert compared.dry.min() == 1.0
+    assert compared.counted.min() > 0.4
+    # Bodies that can exist predict no worse than sums without that condition, but for chance at joint 2.
+    left = 100 * compared.ours / compared.measured
+    assert np.all(left < np.array(TX40_SUMS) + [0, 0.2, 0, 0, 0, 0]), left
+    assert np.all(compared.theirs < 1.05 * compared.ours)
+    replay = check_export(tmp_path / "out" / "result.json", "mjcf", file, tmp_path / "last_third.csv")
+    assert replay.before is None
+    assert replay.difference.max() < 1e-3
+    assert "your file" not in str(replay)

@@ -11,6 +11,8 @@ from jaxid.build import build_machine
 from jaxid.case.case import read_case
 from jaxid.commands.export import check_export, draw_exports, export
 from jaxid.errors import InputError
+from jaxid.export.found_machine import case_of, found_machine
+from jaxid.export.replayed import mujoco_robot
 from jaxid.results.model_json import drives_json, robot_json
 from tests.support.urdf_arms import arm
 from tests.support.written_logs import write_csv
@@ -121,6 +123,20 @@ def test_a_replay_says_how_near_the_file_is_and_what_it_lacks(tmp_path, capsys):
     assert status("other.xml", "bad.csv") == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "other.xml").exists()
+
+
+def test_a_motor_whose_gain_was_found_takes_the_commands(tmp_path):
+    result = result_of(tmp_path, text(), text(**TRUE), FORCED)
+    model = result["model"]
+    gain = {"kind": "actuator_gain", "joint": 1, "joint_name": "a", "name": "actuator_gain[1]"}
+    model["effects"].append(gain | {"parameters": {"gain": 0.8}})
+    case = case_of(model, "result")
+    machine = found_machine(model, case, build_machine(case, period=1 / RATE))
+    file = export(result, "mjcf")
+    assert b'gear="1.6"' in file.content
+    assert mujoco_robot(file.content, tmp_path / "robot.xml", model, case, machine).driven
+    other = file.content.replace(b'gear="1.6"', b'gear="1.5"')
+    assert not mujoco_robot(other, tmp_path / "robot.xml", model, case, machine).driven
 
 
 @pytest.mark.slow
