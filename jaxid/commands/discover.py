@@ -14,7 +14,7 @@ from jaxid.case.user_faults import named_faults
 from jaxid.consistency.absent import acts_by_position
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.break_away import BreakAway, break_away
-from jaxid.discovery.final import final_machine
+from jaxid.discovery.final import final_machine, machine_with
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.in_loop.search import explore_within
 from jaxid.discovery.in_loop.unforced import explore_unforced
@@ -35,16 +35,18 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
 from jaxid.estimators.several.parts import parts_of
-from jaxid.gap import Gap, gaps, noise_floor
+from jaxid.gap import Gap, force_gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
+from jaxid.model.effect import Effect
 from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import free_effect
 from jaxid.numerics.lanes import begin, run_alone
 from jaxid.numerics.precision import NoiseModel
 from jaxid.session import Logs, OpenedLog, Session, open_session
+from jaxid.session.holds import session_under_better_hold
 from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.solvers import SOLVERS
 
@@ -124,7 +126,8 @@ def explore(
         InputError: If the reference has unknowns.
     """
     need_known_reference(session, "an error of it would be taken for an effect")
-    chosen, max_effects = max_effects is None, _EFFECTS if max_effects is None else max_effects
+    asked, chosen = max_effects, max_effects is None
+    max_effects = _EFFECTS if max_effects is None else max_effects
     if session.machine.unforced(session.fit.log):
         _need_one_servo(session)
         return explore_unforced(session, max_effects=max_effects, progress=progress)
@@ -146,6 +149,10 @@ def explore(
         max_effects = max(max_effects, _BY_JOINT * session.fit.data.q.shape[1])
     steps = search.run(max_effects)
     steps = add_together(search, steps, max_effects)
+    if (other := _under_better_hold(session, search, baseline.machine)) is not None:
+        declared.cancel()
+        progress("searching under the other hold of the force")
+        return explore(other, max_effects=asked, refit=refit, experiments=experiments, progress=progress)
     likely = search.model
     refitted = None
     if likely.added:
@@ -184,6 +191,27 @@ def explore(
         proposals=separating,
         unseen=found.unseen,
     )
+
+
+def _under_better_hold(session: Session, search: Search, machine: Machine) -> Session | None:
+    """Return the session under the other hold of its force, if what was found explains the log better so.
+
+    Effects that shift the force in time may stand for a wrong hold: they are left out.
+    """
+    model = search.model
+    if not model.added:
+        return None
+    added = [c for c in model.added if _keeps_time(cand.effect_of(search.superset, c))]
+    found, _ = machine_with(machine, search.superset, added, model.theta)
+    if len(added) == len(model.added):
+        return session_under_better_hold(session, found)
+    whole, _ = machine_with(machine, search.superset, model.added, model.theta)
+    rival = force_gap(session.fit.machine(whole), session.fit.data).rms
+    return session_under_better_hold(session, found, rival)
+
+
+def _keeps_time(effect: Effect) -> bool:
+    return effect.adds_force and not effect.adds_spring and not effect.delays_command()
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,8 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.simulation.force_balance import ForceData, measured_force
 
+# Part of the gap with a shift in time that the other hold leaves at most, to stand in place of the shift.
+_LESS = 0.98
 # Part of the gap under one hold that the other leaves at most, to be the better one.
 _CLEARLY = 0.9
 # Stretches of a log whose gaps are compared. Their mean difference must exceed so many standard errors: one
@@ -25,7 +27,12 @@ _EVIDENCE = 12.0
 
 
 def better_hold(
-    machine: Machine, log: Log, data: Prepared, fit: BalanceFit
+    machine: Machine,
+    log: Log,
+    data: Prepared,
+    fit: BalanceFit,
+    *,
+    rival: Float[np.ndarray, " n"] | None = None,
 ) -> tuple[str, Float[np.ndarray, " 2"]] | None:
     """Compare the force gaps under both holds.
 
@@ -38,6 +45,8 @@ def better_hold(
         log: The log.
         data: The log, prepared under its hold.
         fit: Balance of the prepared log.
+        rival: Force gap of each joint under the log's hold with effects that shift the force in time [N or
+            N m]. The other hold is also the better one if it leaves less without them.
 
     Returns:
         The other hold and the gaps under the log's and under the other [N or N m], of the drive whose gap
@@ -60,7 +69,9 @@ def better_hold(
     gaps = np.array([fit.rms(e) for e in residuals])
     driven = [int(j) for j in machine.plant.driven(machine.plant.joints)]
     least = driven[int(np.argmin(gaps[1, driven] / np.maximum(gaps[0, driven], 1e-300)))]
-    return (other, gaps[:, least]) if clearly_better(residuals[1], residuals[0], fit) else None
+    simpler = rival is not None and bool(np.all(gaps[1, driven] < _LESS * rival[driven]))
+    better = simpler or clearly_better(residuals[1], residuals[0], fit)
+    return (other, gaps[:, least]) if better else None
 
 
 def clearly_better(

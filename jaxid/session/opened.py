@@ -61,6 +61,7 @@ class Session:
         given: The case as it was given, where `case` is that of the joints (see `at_joints`).
         settings: Choices made from the log, by name: `value` and `reason`.
         more: Further logs that are fitted with the first one.
+        chooses_hold: Whether the hold of the force is chosen from the log, because nobody states it.
     """
 
     case: Case
@@ -72,6 +73,7 @@ class Session:
     given: Case | None = None
     settings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     more: tuple[OpenedLog, ...] = ()
+    chooses_hold: bool = False
 
     @property
     def declared(self) -> Case:

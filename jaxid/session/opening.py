@@ -19,6 +19,7 @@ from jaxid.machine import Machine
 from jaxid.own_values import OwnValues, expanded, own_values
 from jaxid.session.against_case import hold_against_case
 from jaxid.session.checks import log_findings, parts_left_out
+from jaxid.session.holds import session_under_hold
 from jaxid.session.opened import Logs, OpenedLog, Session
 from jaxid.session.preparing import (
     enough,
@@ -111,7 +112,7 @@ def open_session(
     if short:
         return session
     chooses_hold = not isinstance(source.log, Log) and "hold" not in case.tables.get("log", {})
-    return _held_against_case(session, several=several, chooses_hold=chooses_hold)
+    return _held_against_case(replace(session, chooses_hold=chooses_hold), several=several)
 
 
 def _first_log(case: Case, log: Logs, *, piecewise: bool) -> tuple[Source, Log, list[Source]]:
@@ -246,13 +247,12 @@ def _open_source(source: Source, log: Log, machine: Machine, recipe: Recipe, nee
     )
 
 
-def _held_against_case(session: Session, *, several: bool, chooses_hold: bool) -> Session:
+def _held_against_case(session: Session, *, several: bool) -> Session:
     """Return a session after its fitted logs have been held against the case.
 
     Args:
         session: The session.
         several: Whether values may differ between its logs.
-        chooses_hold: Whether the hold of the force is to be chosen, because nobody states it.
 
     Returns:
         The session with the holds of reference and force, the noise of the force, and warnings.
@@ -261,14 +261,11 @@ def _held_against_case(session: Session, *, several: bool, chooses_hold: bool) -
         InputError: If a log contradicts the case.
     """
     case, machine, fit = session.declared, session.machine, session.fit
-    found = hold_against_case(case, fit.machine(machine) if several else machine, fit, chooses_hold)
-    machine = replace(machine, reference_hold=found.reference_hold)
-    opened, more = [fit, *session.validations], list(session.more)
+    found = hold_against_case(case, fit.machine(machine) if several else machine, fit, session.chooses_hold)
+    session = session.with_machine(replace(machine, reference_hold=found.reference_hold))
     if found.hold is not None:
-        machine = replace(machine, hold=found.hold)
-        stated = [v["name"] for v in session.case.tables.get("validation", []) if "hold" in v]
-        opened = [run if run.name in stated else under_hold(found.hold, run, machine) for run in opened]
-        more = [under_hold(found.hold, run, machine) for run in more]
+        session = session_under_hold(session, found.hold)
+    machine, opened, more = session.machine, [session.fit, *session.validations], list(session.more)
 
     # The logs to validate on are of the same sensors.
     opened = [_with_force_noise(run, found.force_noise) for run in opened]
