@@ -295,6 +295,7 @@ def _with_break_aways(
         c = missing.pop(leaving.index(b))
         where = found.where if found.effects else _at_starts(found.where, c, b)
         estimate, effect, step = _with_break_away(found.estimate, search, c, b)
+        estimate = replace(estimate, notes=(*estimate.notes, _rival_at_rest(session, effect, c.port)))
         steps.append(step)
         found = _Found(estimate, (*found.effects, effect), where, unseen)
     return found
@@ -415,6 +416,17 @@ def _with_break_away(
     score = Score(c, 0, np.array([b.level]), b.evidence)
     found = NamedEffect(c.kind, c.label, plant.place(c.port), (free[0].name,), score, ())
     return new, found, Step(score, None, (score,), b.threshold, search.theta, search.active)
+
+
+def _rival_at_rest(session: Session, effect: NamedEffect, port: int) -> str:
+    """Return the note that a friction which fades just above rest looks as a break-away friction does."""
+    slow = session.fit.data.recipe.rest_velocity[port]
+    unit = session.machine.unit("position/time", port)
+    return (
+        f"{effect.label} was found at the starts from rest, where no stribeck_friction is tried: one that "
+        f"fades below {slow:.2g} {unit}, the slowest motion that counts, would look alike, and the level is "
+        "not its height"
+    )
 
 
 def _at_starts(where: Where, c: cand.Candidate, b: BreakAway) -> Where:

@@ -87,6 +87,9 @@ def test_the_missing_effect_is_found(kind, tmp_path):
     assert kind in named
     assert d.kinds[0] in {kind, *case.also}
     assert kind in AT_REST or closed(d) >= 0.9
+    assert any("no stribeck_friction is tried" in note for note in d.after.notes) == (
+        kind == "static_friction"
+    )
     if d.kinds[0] != kind:
         # The rival's values are not the truth's; the two must be equally likely.
         leader = d.effects[0].score
