@@ -230,7 +230,7 @@ def _finish_levels(plant: Plant, sums: _Sums) -> None:
         for i in _contributed(levels):
             levels[i] = levels[i] * sums.dry_scale[i]
         for i, joint, ratio in plant.geared:
-            if not isinstance(levels[i], float):
+            if _is_sum(levels[i]):
                 levels[i], levels[joint] = 0.0, levels[joint] + ratio * levels[i]
 
 
@@ -255,7 +255,12 @@ def _while_rising(rising: Float[Array, "2 ports"], sign: Array, ydd: Array) -> A
 
 def _contributed(levels: list[Sum]) -> tuple[int, ...]:
     """Return the ports to whose sum any effect has contributed."""
-    return tuple(i for i, x in enumerate(levels) if not isinstance(x, float))
+    return tuple(i for i, x in enumerate(levels) if _is_sum(x))
+
+
+def _is_sum(x: Sum) -> bool:
+    """Check that any effect has contributed; numpy's numbers, of which plants may consist, are floats too."""
+    return type(x) is not float
 
 
 def port_motion(plant: Plant, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array]:

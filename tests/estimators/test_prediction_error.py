@@ -14,6 +14,7 @@ from jaxid.consistency.law import noise_free_command
 from jaxid.errors import InputError
 from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.scoring import maximise_likelihood
+from jaxid.estimators.likelihood import likelihood_of
 from jaxid.estimators.prediction_error import prediction_error, whiteness
 from jaxid.session import open_session
 from jaxid.simulation.kalman import readings_used, slow_samples, smooth_steps
@@ -136,6 +137,16 @@ def test_steps_are_counted_where_the_fit_starts(tmp_path, monkeypatch):
         with pytest.raises(InputError, match="enough"):
             prediction_error(session.machine, session.fit.log, start=start)
     assert counted == [TRUE[0], pytest.approx(TRUE[0] / 1.5)]
+
+
+def test_a_machine_at_its_estimates_leaves_out_the_same_samples_at_rest(tmp_path):
+    """Its values are numbers of numpy, as those of a refit are."""
+    session = open_session(*opened(tmp_path, 1, closed=False))
+    machine, rest = session.machine, np.asarray(session.fit.data.recipe.rest_velocity)
+    again = machine.with_estimate(machine.parameters.guess)
+    counts = [likelihood_of(m, session.fit.log, rest_velocity=rest).problem.counts for m in (machine, again)]
+    np.testing.assert_array_equal(counts[0], counts[1])
+    assert counts[0].sum() < session.fit.log.samples
 
 
 @pytest.mark.parametrize("closed", [False, True])
