@@ -14,6 +14,7 @@ from jaxid.case.user_faults import named_faults
 from jaxid.consistency.absent import acts_by_position
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.break_away import BreakAway, break_away
+from jaxid.discovery.at_rest.fading import Fading, fading_friction
 from jaxid.discovery.final import final_machine, machine_with
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.in_loop.search import explore_within
@@ -294,8 +295,13 @@ def _with_break_aways(
         b = max(held, key=lambda b: b.evidence)
         c = missing.pop(leaving.index(b))
         where = found.where if found.effects else _at_starts(found.where, c, b)
-        estimate, effect, step = _with_break_away(found.estimate, search, c, b)
-        estimate = replace(estimate, notes=(*estimate.notes, _rival_at_rest(session, effect, c.port)))
+        progress("comparing with friction that fades above rest")
+        fading = fading_friction(session, found.estimate, search.superset, c.port, b)
+        if fading is None:
+            estimate, effect, step = _with_break_away(found.estimate, search, c, b)
+            estimate = replace(estimate, notes=(*estimate.notes, _rival_at_rest(session, effect, c.port)))
+        else:
+            estimate, effect, step = _with_fading(search, fading, b)
         steps.append(step)
         found = _Found(estimate, (*found.effects, effect), where, unseen)
     return found
@@ -418,14 +424,21 @@ def _with_break_away(
     return new, found, Step(score, None, (score,), b.threshold, search.theta, search.active)
 
 
+def _with_fading(search: Search, fading: Fading, b: BreakAway) -> tuple[Estimate, NamedEffect, Step]:
+    """Return the fit with a friction that fades just above rest, in place of a break-away friction."""
+    c, place = fading.candidate, fading.estimate.machine.plant.place(fading.candidate.port)
+    score = Score(c, 0, fading.values, fading.evidence)
+    found = NamedEffect(c.kind, c.label, place, fading.names, score, ())
+    return fading.estimate, found, Step(score, None, (score,), b.threshold, search.theta, search.active)
+
+
 def _rival_at_rest(session: Session, effect: NamedEffect, port: int) -> str:
     """Return the note that a friction which fades just above rest looks as a break-away friction does."""
     slow = session.fit.data.recipe.rest_velocity[port]
     unit = session.machine.unit("position/time", port)
     return (
-        f"{effect.label} was found at the starts from rest, where no stribeck_friction is tried: one that "
-        f"fades below {slow:.2g} {unit}, the slowest motion that counts, would look alike, and the level is "
-        "not its height"
+        f"{effect.label} was found at the starts from rest: a stribeck_friction that fades below "
+        f"{slow:.2g} {unit}, the slowest motion that counts, would look alike there"
     )
 
 

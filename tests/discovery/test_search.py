@@ -87,7 +87,7 @@ def test_the_missing_effect_is_found(kind, tmp_path):
     assert kind in named
     assert d.kinds[0] in {kind, *case.also}
     assert kind in AT_REST or closed(d) >= 0.9
-    assert any("no stribeck_friction is tried" in note for note in d.after.notes) == (
+    assert any("found at the starts from rest" in note for note in d.after.notes) == (
         kind == "static_friction"
     )
     if d.kinds[0] != kind:
