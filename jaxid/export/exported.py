@@ -128,7 +128,7 @@ def rotors_of(model: Mapping[str, Any]) -> np.ndarray | None:
 
 
 def notes_of_case(model: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return sentences on what the case has beside the robot: gears between motors and joints, and payloads."""
+    """Return sentences on gears between motors and joints, and on payloads, which no target holds."""
     notes = []
     if (model.get("drives") or {}).get("transmission"):
         notes.append(
