@@ -150,8 +150,9 @@ class LinkSums(NamedTuple):
         turning = [k for k, (name, _) in enumerate(sums.standard) if name not in TEN]
         final = own.copy()
         for joint, column in enumerate(turning):
-            # One that is left out of the sums has a value only if the case states it.
-            stated = own[joint] != 0 and sums.standard[column] not in sums.places
+            # One value stands for an unknown sum, the others are zero: a second one is stated by the case.
+            beside = _beside(sums, column, found)
+            stated = own[joint] != 0 and beside.any()
             if not stated and not _alone(sums, column):
                 final[joint] = rotors[joint]
         mapping = sums.mapping[:, columns]
@@ -188,6 +189,15 @@ def _alone(sums: BaseParameters, column: int) -> bool:
     """Check that a parameter is a sum of itself alone."""
     rows = np.flatnonzero(sums.mapping[:, column])
     return rows.size == 1 and np.count_nonzero(sums.mapping[rows[0]]) == 1
+
+
+def _beside(
+    sums: BaseParameters, column: int, links: Float[np.ndarray, "links 10"]
+) -> Float[np.ndarray, " values"]:
+    """Return the values of links in the sums of which a parameter is part."""
+    members = np.flatnonzero(np.any(sums.mapping[sums.mapping[:, column] != 0] != 0, axis=0))
+    places = (sums.standard[k] for k in members)
+    return np.array([links[link, TEN.index(name)] for name, link in places if name in TEN])
 
 
 def _sums_of(plant: LinkTree) -> BaseParameters:
