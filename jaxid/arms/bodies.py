@@ -77,7 +77,8 @@ def bodies_of(
 
     Links that are bodies themselves are returned as they are. Otherwise each is a body of positive density
     whose sums, the base parameters, are those of the plant: Newton steps of least size in the log-Cholesky
-    coordinates of the bodies, from the file's on. Rotors that are part of a sum stay those of the file.
+    coordinates of the bodies, from the file's on. Rotors that are part of a sum stay those that the case
+    states, or those of the file.
 
     Args:
         plant: The plant; its parameters may be base parameters, with zeros for the others. Its rotors are
@@ -135,7 +136,8 @@ class LinkSums(NamedTuple):
     ) -> tuple[LinkSums, Float[np.ndarray, " n"]]:
         """Return the sums of a plant that its links have, and its rotors.
 
-        A rotor that is part of a sum is that of the file, and the links have the rest of the sum.
+        A rotor that is part of a sum is the one that the case states, or else that of the file. The links
+        have the rest of the sum.
 
         Args:
             plant: The plant, its rotors as seen at the joints.
@@ -146,8 +148,13 @@ class LinkSums(NamedTuple):
         own = np.zeros(plant.joints) if plant.rotor_inertia is None else np.asarray(plant.rotor_inertia)
         columns = [k for k, (name, _) in enumerate(sums.standard) if name in TEN]
         turning = [k for k, (name, _) in enumerate(sums.standard) if name not in TEN]
-        alone = [_alone(sums, c) for c in turning]
-        final = np.where(alone, own, rotors) if turning else own
+        final = own.copy()
+        for joint, column in enumerate(turning):
+            # One value stands for an unknown sum, the others are zero: a second one is stated by the case.
+            beside = _beside(sums, column, found)
+            stated = own[joint] != 0 and beside.any()
+            if not stated and not _alone(sums, column):
+                final[joint] = rotors[joint]
         mapping = sums.mapping[:, columns]
         kinds = np.array([TEN.index(sums.standard[c][0]) for c in columns])
         links = np.array([sums.standard[c][1] for c in columns])
@@ -182,6 +189,15 @@ def _alone(sums: BaseParameters, column: int) -> bool:
     """Check that a parameter is a sum of itself alone."""
     rows = np.flatnonzero(sums.mapping[:, column])
     return rows.size == 1 and np.count_nonzero(sums.mapping[rows[0]]) == 1
+
+
+def _beside(
+    sums: BaseParameters, column: int, links: Float[np.ndarray, "links 10"]
+) -> Float[np.ndarray, " values"]:
+    """Return the values of links in the sums of which a parameter is part."""
+    members = np.flatnonzero(np.any(sums.mapping[sums.mapping[:, column] != 0] != 0, axis=0))
+    places = (sums.standard[k] for k in members)
+    return np.array([links[link, TEN.index(name)] for name, link in places if name in TEN])
 
 
 def _sums_of(plant: LinkTree) -> BaseParameters:

@@ -118,7 +118,7 @@ def robot_of_model(model: Any, file: str = "model") -> Robot:
     """
     mujoco, notes = need_mujoco(file), list[str]()
     names = [model.joint(k).name or f"joint{k + 1}" for k in range(model.njnt)]
-    joints = _joints(mujoco, model, names, notes)
+    joints, places = _joints(mujoco, model, names, notes)
     follows, held = _equalities(mujoco, model, names, notes)
     joints = [replace(joint, follows=follows.get(joint.name)) for joint in joints]
     joints = _with_motors(mujoco, model, joints, names, notes)
@@ -127,11 +127,17 @@ def robot_of_model(model: Any, file: str = "model") -> Robot:
     notes += [f"joint '{name}' is fixed by an equality: state its position in held" for name in held]
     weight = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
     x, y, z = (float(g) for g in model.opt.gravity) if weight else (0.0, 0.0, 0.0)
-    return Robot(file, tuple(joints), (x, y, z), drives, float(model.opt.timestep), tuple(notes))
+    period = float(model.opt.timestep)
+    return Robot(file, tuple(joints), (x, y, z), drives, period, tuple(notes), places)
 
 
-def _joints(mujoco: Any, model: Any, names: list[str], notes: list[str]) -> list[RobotJoint]:
-    """Return hinges and slides with the bodies behind them; free and ball joints are held."""
+def _joints(
+    mujoco: Any, model: Any, names: list[str], notes: list[str]
+) -> tuple[list[RobotJoint], dict[str, tuple[int, np.ndarray]]]:
+    """Return hinges and slides with the bodies behind them, and the places of bodies.
+
+    Free and ball joints are held.
+    """
     kinds = mujoco.mjtJoint
     motions = {kinds.mjJNT_HINGE: "revolute", kinds.mjJNT_SLIDE: "prismatic"}
     out: list[RobotJoint] = []
@@ -164,7 +170,7 @@ def _joints(mujoco: Any, model: Any, names: list[str], notes: list[str]) -> list
             xx, yy, zz = model.body_inertia[b]
             ten = np.array([model.body_mass[b], 0.0, 0.0, 0.0, xx, 0.0, 0.0, yy, 0.0, zz])
             out[carrier] = replace(out[carrier], body=out[carrier].body + body_in(ten, inertial))
-    return out
+    return out, {model.body(b).name: place for b, place in enumerate(carriers)}
 
 
 def _joint(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -92,6 +92,8 @@ class Robot:
         drives: Its actuators.
         period: Time step of its simulation [s], with which its servos run; None: not stated.
         notes: Parts of the file that this does not hold, a sentence each.
+        places: Index of the joint that carries each link of the file (-1: the base), and the link's frame in
+            that of the joint, itself at zero, (4, 4).
     """
 
     file: str
@@ -100,6 +102,7 @@ class Robot:
     drives: tuple[RobotDrive, ...] = ()
     period: float | None = None
     notes: tuple[str, ...] = ()
+    places: Mapping[str, tuple[int, Float[np.ndarray, "4 4"]]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -243,7 +246,12 @@ def kept(robot: Robot, names: Sequence[str] | None, held: Mapping[str, float]) -
             body = joints[before].body + body_in(joint.body, place)
             joints[before] = replace(joints[before], body=body)
     drives = tuple(drive for drive in robot.drives if drive.joint in names)
-    return replace(robot, joints=tuple(joints), drives=drives)
+    places = dict(robot.places)
+    for link, (joint, frame) in robot.places.items():
+        if joint >= 0:
+            now, before = carrier[joint]
+            places[link] = now, before @ frame
+    return replace(robot, joints=tuple(joints), drives=drives, places=places)
 
 
 def spring(stiffness: Sequence[float], rest: float) -> tuple[float, float, float, float]:

@@ -84,6 +84,9 @@ def read_tree(given: Mapping[str, Any], table: Mapping[str, Any], spot: Spot) ->
     gravity = given.get("gravity_vector", robot.gravity)
     if gravity is not None:
         options["gravity_vector"] = gravity
+    points = _payload_points(tree)
+    if points is not None:
+        options["payload_position"] = points
     ratios = _gear_ratios(tree)
     if ratios is not None:
         options["gear_ratio"] = ratios
@@ -132,6 +135,26 @@ def _gear_ratios(tree: Tree) -> list[float] | None:
         return [float(given)] * len(tree.names)
     _check_names(given, tree.names, tree.at.at("gear_ratio"))
     return [float(given.get(name, 1.0)) for name in tree.names]
+
+
+def _payload_points(tree: Tree) -> np.ndarray | None:
+    """Return the point of each link at which it may carry a payload; None if the case names none."""
+    given, robot, spot = tree.given.get("payload_at"), tree.robot, tree.at.at("payload_at")
+    if given is None:
+        return None
+    out, loaded = np.zeros((len(robot.joints), 3)), dict[int, str]()
+    for link, point in given.items():
+        if link not in robot.places:
+            raise spot.fault(f"names '{link}', which is no link of the file", suggest(link, robot.places))
+        carrier, frame = robot.places[link]
+        if carrier < 0:
+            raise spot.fault(f"names '{link}', which no joint moves", "name a link behind a joint")
+        if carrier in loaded:
+            what = f"names '{loaded[carrier]}' and '{link}', which move as one"
+            raise spot.fault(what, "keep one of them")
+        loaded[carrier] = link
+        out[carrier] = frame[:3, :3] @ np.array(point) + frame[:3, 3]
+    return out
 
 
 def _check_names(given: Any, names: tuple[str, ...], spot: Spot) -> None:
@@ -195,8 +218,13 @@ def _parameters(tree: Tree, options: dict[str, Any]) -> dict[str, tuple[Value, .
         out["rotor_inertia"] = tuple(
             Value(float(v), bool(f)) for v, f in zip(rotors, free["rotor_inertia"], strict=True)
         )
+    if "payload_at" in tree.given:
+        out["payload"] = (Value(0.0),) * len(robot.joints)
+    elif "payload" in stated:
+        hint = 'state payload_at = { "<link>" = [x, y, z] } in [plant]'
+        raise spot.at("payload").fault("has no place", hint)
     for name, value in stated.items():
-        of_links = name in TEN
+        of_links = name in (*TEN, "payload")
         places = robot.names if of_links else tree.names
         out[name] = _stated(value, infos[name], out[name], places, spot.at(name))
     return out

@@ -95,6 +95,12 @@ TREE: Keys = {
         unit="m/s^2",
         note="as in the file",
     ),
+    "payload_at": Key(
+        _by_name(several(number(), shortest=3, longest=3)),
+        "point at which a link or body of the file carries a payload, in that link's frame",
+        unit="m",
+        note="no payload",
+    ),
     "parameters": Key(anything, "values in place of the file's, by joint: mass = { elbow = 2.0 }"),
 }
 

@@ -146,8 +146,10 @@ def read_urdf_tree(path: str | Path) -> Robot:
 
     out: list[RobotJoint] = []
     bodies: list[np.ndarray] = []
+    places: dict[str, tuple[int, np.ndarray]] = {}
 
     def visit(link: str, body: int, frame: np.ndarray) -> None:
+        places[link] = body, frame
         inertial = links[link].find("inertial")
         if inertial is not None and body >= 0:
             bodies[body] += read_inertial(inertial, frame, f"{file}, link '{link}'")
@@ -167,7 +169,7 @@ def read_urdf_tree(path: str | Path) -> Robot:
         replace(joint, body=body, follows=leaders.get(joint.name))
         for joint, body in zip(out, bodies, strict=True)
     )
-    return Robot(file, whole, notes=tuple(notes))
+    return Robot(file, whole, notes=tuple(notes), places=places)
 
 
 def _tree_joint(joint: _Joint, parent: int, place: np.ndarray, file: str) -> RobotJoint:

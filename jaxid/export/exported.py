@@ -127,10 +127,14 @@ def rotors_of(model: Mapping[str, Any]) -> np.ndarray | None:
     return np.asarray(rotors) * (1.0 if ratios is None else np.asarray(ratios) ** 2)
 
 
-def transmission_notes(model: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a sentence on the gears between the motors of the log and the joints; nothing without them."""
-    if not (model.get("drives") or {}).get("transmission"):
-        return ()
-    return (
-        "the transmission of the case: commands are forces of the joints, and the log's are of the motors",
-    )
+def notes_of_case(model: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return sentences on gears between motors and joints, and on payloads, which no target holds."""
+    notes = []
+    if (model.get("drives") or {}).get("transmission"):
+        notes.append(
+            "the transmission of the case: commands are forces of the joints, and the log's are of the motors"
+        )
+    for link, mass in zip(model["links"], model["parameters"].get("payload") or (), strict=False):
+        if mass:
+            notes.append(f"the payload of joint '{link}' ({mass:.6g} kg) is no part of the robot")
+    return tuple(notes)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.export.exported import ExportedFile, JointLaws, rotors_of, shown, transmission_notes
+from jaxid.export.exported import ExportedFile, JointLaws, notes_of_case, rotors_of, shown
 from jaxid.export.plain import identifier
 
 # Effects that a joint of Isaac Lab has, with their parameter.
@@ -56,7 +56,7 @@ def export_isaaclab(model: Mapping[str, Any], stem: str, version: str, where: st
     """
     laws = JointLaws.of(model, _LAWS, ())
     notes = [f"{shown(model['effects'][k])} has no place in an actuator of Isaac Lab" for k in laws.lost]
-    notes += transmission_notes(model)
+    notes += notes_of_case(model)
     names, drives = model["joints"], model.get("drives") or {"joints": [], "gain": [], "controller": None}
     gain, limits, delays = {}, {}, {}
     for joint, factor in zip(drives["joints"], drives["gain"], strict=True):

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jaxid.export.exported import is_nothing, shown, transmission_notes
+from jaxid.export.exported import is_nothing, notes_of_case, shown
 
 # Force that a drive needs to overcome an effect: position q, velocity v, acceleration a, gravity g.
 _FORMULAS = {
@@ -114,7 +114,7 @@ def written(model: Mapping[str, Any], language: Language, field: float) -> Writt
     count = len(model["joints"])
     forces: list[list[str]] = [[] for _ in range(count)]
     commands: list[list[str]] = [[] for _ in range(count)]
-    notes, lost = list(transmission_notes(model)), []
+    notes, lost = list(notes_of_case(model)), []
     for number, effect in enumerate(model["effects"]):
         if is_nothing(effect):
             continue

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.export.exported import ExportedFile, JointLaws, shown, transmission_notes
+from jaxid.export.exported import ExportedFile, JointLaws, notes_of_case, shown
 from jaxid.export.mjcf import DAMPING, JOINT_LAWS, SPRING, spring_of
 from jaxid.export.new_robot import NewRobot, comment, escaped, leader_of, leading_of, listed, numbers
 from jaxid.export.shaft_tendons import ShaftTendons
@@ -57,7 +57,7 @@ def new_mjcf(model: Mapping[str, Any], stem: str, version: str, where: str) -> E
     work = _Work(NewRobot.of(model, where), model, leading_of(model))
     bodies = "".join(f"    {line}\n" for link in work.robot.children(-1) for line in work.body(link))
     sections = "".join(work.sections())
-    notes = (*work.robot.notes, *work.notes, *transmission_notes(model))
+    notes = (*work.robot.notes, *work.notes, *notes_of_case(model))
     text = _MJCF.format(
         comment=comment(stem, version, notes),
         name=escaped(stem),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.export.exported import ExportedFile, JointLaws, shown, transmission_notes
+from jaxid.export.exported import ExportedFile, JointLaws, notes_of_case, shown
 from jaxid.export.new_robot import NewRobot, comment, escaped, leader_of, leading_of, listed, numbers
 
 # Effects that <dynamics> states, with their parameter, and its attributes.
@@ -54,7 +54,7 @@ def new_urdf(model: Mapping[str, Any], stem: str, version: str, where: str) -> E
     gravity = tuple(map(float, model["gravity_vector"]))
     if gravity != _USUAL:
         notes.append(f"gravity {list(gravity)} m/s^2 has no place in a URDF: set it in the simulation")
-    notes += transmission_notes(model)
+    notes += notes_of_case(model)
     text = _URDF.format(
         comment=comment(stem, version, notes),
         name=escaped(stem),

@@ -157,7 +157,7 @@ def _place_of(model: Mapping[str, Any], name: str) -> _Place | None:
     infos = parameters_of(LinkTree)
     if whole in infos:
         # A sum of parameters may have either sign, whatever its name.
-        sign = infos[whole].sign if whole == "rotor_inertia" else "free"
+        sign = infos[whole].sign if whole in ("rotor_inertia", "payload") else "free"
         return _Place(("parameters", whole), entry, sign)
     if whole.startswith("controller."):
         law = (model.get("drives") or {}).get("controller") or {}

@@ -40,6 +40,8 @@ class LinkTree(WithLinks):
             frame's origin, by link; off its diagonal -sum of m x y and so on [kg m^2].
         rotor_inertia: Inertia of each drive, (n,) [kg m^2, or kg at a prismatic joint], or None for none. It
             is that seen at the joint, or with `gear_ratio` that of the motor.
+        payload: Point mass that each link carries beside its ten parameters, by link [kg], or None.
+        payload_position: Position of each payload in its link's frame, (links, 3) [m]; None: the origin.
         geometry: Frame of each link in that on which it hangs.
         shafts: Ratios by which each shaft turns with the joints, a row of n for each shaft.
         gravity_vector: Acceleration of gravity in the base's frame, (3,) [m/s^2].
@@ -75,6 +77,12 @@ class LinkTree(WithLinks):
     inertia_zz: Array = parameter(*_SECOND, "about the frame's origin", more=0, motion="rotary")
     rotor_inertia: Array | None = parameter(
         "inertia", "nonnegative", "of each drive, seen at the joint", optional=True, more=0
+    )
+    payload: Array | None = parameter(
+        "inertia", "nonnegative", "point masses that links of a tree carry, see payload_at", optional=True, more=0, motion="linear"
+    )
+    payload_position: Array | None = eqx.field(
+        converter=lambda x: None if x is None else as_array(x), default=None, kw_only=True
     )
     geometry: Geometry = eqx.field(kw_only=True)
     shafts: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=(), kw_only=True)
@@ -189,7 +197,14 @@ class LinkTree(WithLinks):
         return jnp.sum(self._ratios() * x[None, :], axis=1) if self.copies else x
 
     def _moments(self) -> Float[Array, "links 4 4"]:
-        return pseudo_inertia(self.mass, self._first_moments(), self._tensors())
+        links = pseudo_inertia(self.mass, self._first_moments(), self._tensors())
+        if self.payload is None:
+            return links
+        points = self.payload_position
+        if points is None:
+            points = jnp.zeros((len(self.payload), 3))
+        points = jnp.concatenate([points, jnp.ones_like(points[:, :1])], axis=1)
+        return links + self.payload[:, None, None] * points[:, :, None] * points[:, None, :]
 
     def _first_moments(self) -> Float[Array, "links 3"]:
         return jnp.stack([self.first_moment_x, self.first_moment_y, self.first_moment_z], axis=-1)

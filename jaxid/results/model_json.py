@@ -96,7 +96,7 @@ def bodies_json(plant: LinkTree, entry: PlantEntry) -> dict[str, Any] | None:
     rotors = plant.rotor_inertia
     if rotors is not None and plant.gear_ratio is not None:
         rotors = rotors * plant.gear_ratio**2
-    bare = replace(plant, effects=(), rotor_inertia=rotors, gear_ratio=None)
+    bare = replace(plant, effects=(), rotor_inertia=rotors, gear_ratio=None, payload=None)
     found = bodies_of(bare, entry.bodies, entry.rotors)
     links = dict(zip(TEN, found.links.T.tolist(), strict=True))
     return {**links, "rotor_inertia": found.rotors.tolist(), "error": found.error}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
 from jaxid.results.report.data import PoseStrip
 
@@ -30,10 +32,13 @@ def poses_of(session: Session, run: OpenedLog, after: Gap) -> PoseStrip | None:
         run: The log.
         after: Its gap, with the simulated motion if there is one.
     """
-    plant, log = session.machine.plant, run.log
+    plant, log, of_file = session.machine.plant, run.log, session.case.plant.bodies
     if not isinstance(plant, LinkTree) or log.steady is not None or not np.all(log.measured):
         return None
     simulated = None if after.simulation is None else np.asarray(after.simulation.position)
+    if of_file is not None:
+        # Sums of parameters place no end of an arm: a link whose mass is part of a sum has none left.
+        plant = replace(plant, **dict(zip(TEN, of_file.T, strict=True)))
     return strip_of(plant, run.name, log.time, log.position, simulated)
 
 

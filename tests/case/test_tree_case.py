@@ -151,6 +151,28 @@ def test_base_parameters_of_a_tree_with_a_follower_move_it_as_all_do(tmp_path):
     np.testing.assert_allclose(base.inertial(*states), whole.inertial(*states), rtol=1e-9)
 
 
+@pytest.mark.parametrize("plant", [{}, {"held": {"joint3": 0.4}}], ids=["free", "held"])
+def test_a_payload_hangs_at_a_point_of_a_link(folder, plant):
+    """Against a link of that mass in the file, fixed at the point; the link that carries it may be held."""
+    point, mass = [0.1, -0.2, 0.05], 1.7
+    load = (
+        f'<link name="load"><inertial><mass value="{mass}"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" '
+        'izz="0"/></inertial></link><joint name="grip" type="fixed"><origin xyz="0.1 -0.2 0.05"/>'
+        '<parent link="link3"/><child link="load"/></joint></robot>'
+    )
+    (folder / "loaded.urdf").write_text(branched().replace("</robot>", load))
+    wanted, _ = plant_of(folder, urdf="loaded.urdf", **plant)
+    carrier = "joint2" if "held" in plant else "joint3"
+    stated = {"payload_at": {"link3": point}, "parameters": {"payload": {carrier: mass}}}
+    found, _ = plant_of(folder, **stated, **plant)
+    empty, _ = plant_of(folder, payload_at={"link3": point}, **plant)
+    bare, _ = plant_of(folder, **plant)
+    moments = [np.asarray(p.prepared().moments) for p in (wanted, found, empty, bare)]
+    np.testing.assert_allclose(moments[1], moments[0], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(moments[2], moments[3])
+    assert np.abs(moments[0] - moments[3]).max() > 0.9 * mass
+
+
 def test_friction_and_ranges_of_a_urdf_count(tmp_path):
     text = branched().replace(
         '<joint name="joint2" type="revolute">',
@@ -181,6 +203,9 @@ FAULTS = {
     "length": ({"parameters": {"mass": [1.0]}}, "mass has 1 entries; give 6"),
     "value": ({"parameters": {"mass": {"joint1": -1.0}}}, "mass.joint1 = -1.0 is negative"),
     "links": ({"links": []}, "unknown key 'links'"),
+    "payload": ({"parameters": {"payload": {"joint1": 1.0}}}, "payload has no place; state payload_at"),
+    "no such link": ({"payload_at": {"hand": [0, 0, 0]}}, "payload_at names 'hand', which is no link"),
+    "base link": ({"payload_at": {"base": [0, 0, 0]}}, "payload_at names 'base', which no joint moves"),
 }
 
 

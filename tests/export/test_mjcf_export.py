@@ -147,6 +147,15 @@ def test_bodies_behind_base_parameters_are_real_and_move_alike(tmp_path):
     np.testing.assert_allclose(force(real, states), wanted, atol=1e-8 * np.abs(wanted).max())
 
 
+def test_rotors_that_a_case_states_are_not_put_into_its_links(tmp_path):
+    _, whole, _ = machine_of(tmp_path, cart())
+    stated = [0.3, 0.4, 0.5, 0.6]
+    _, base, _ = machine_of(tmp_path, cart(), unknown=["base"], parameters={"rotor_inertia": stated})
+    found = bodies_of(base, links_of(whole), np.zeros(4))
+    np.testing.assert_array_equal(found.rotors, stated)
+    np.testing.assert_allclose(found.links, links_of(whole), atol=1e-8)
+
+
 def test_results_hold_bodies_that_can_exist(tmp_path):
     entry, base, _ = machine_of(tmp_path, cart(), unknown=["base", "armature"])
     assert not are_bodies(links_of(base))
