@@ -79,7 +79,12 @@ class LinkTree(WithLinks):
         "inertia", "nonnegative", "of each drive, seen at the joint", optional=True, more=0
     )
     payload: Array | None = parameter(
-        "inertia", "nonnegative", "point masses that links of a tree carry, see payload_at", optional=True, more=0, motion="linear"
+        "inertia",
+        "nonnegative",
+        "point masses that links of a tree carry, see payload_at",
+        optional=True,
+        more=0,
+        motion="linear",
     )
     payload_position: Array | None = eqx.field(
         converter=lambda x: None if x is None else as_array(x), default=None, kw_only=True

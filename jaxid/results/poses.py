@@ -32,10 +32,11 @@ def poses_of(session: Session, run: OpenedLog, after: Gap) -> PoseStrip | None:
         run: The log.
         after: Its gap, with the simulated motion if there is one.
     """
-    plant, log, of_file = session.machine.plant, run.log, session.case.plant.bodies
+    plant, log = session.machine.plant, run.log
     if not isinstance(plant, LinkTree) or log.steady is not None or not np.all(log.measured):
         return None
     simulated = None if after.simulation is None else np.asarray(after.simulation.position)
+    of_file = session.case.plant.bodies
     if of_file is not None:
         # Sums of parameters place no end of an arm: a link whose mass is part of a sum has none left.
         plant = replace(plant, **dict(zip(TEN, of_file.T, strict=True)))
