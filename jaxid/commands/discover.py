@@ -53,6 +53,8 @@ from jaxid.simulation.solvers import SOLVERS
 
 # A residual counts as a disagreement only if it exceeds the noise floor by this factor.
 _ABOVE_FLOOR = 1.3
+# Beyond this factor something is missing, even if the residual stands out over no variable.
+_FAR_ABOVE = 3.0
 # Largest number of effects to add unless it is stated, and that by joint of an arm.
 _EFFECTS, _BY_JOINT = 5, 2
 # Number of effects that hinder the simulation and are replaced; further ones are only removed.
@@ -509,8 +511,10 @@ def _verdict(effects: tuple[NamedEffect, ...], where: Where, steps: list[Step], 
         return "found"
     baseline = steps[0].theta
     rms = _rms(search, search.samples, baseline)
-    above = bool(np.any(rms > _ABOVE_FLOOR * search.floor)) and search.acceptance.above_numerics(baseline)
-    return "unexplained" if above and where.significant else "nothing_missing"
+    if not search.acceptance.above_numerics(baseline):
+        return "nothing_missing"
+    above, far = (bool(np.any(rms > factor * search.floor)) for factor in (_ABOVE_FLOOR, _FAR_ABOVE))
+    return "unexplained" if far or (above and where.significant) else "nothing_missing"
 
 
 def _round(search: Search, step: Step) -> Round:

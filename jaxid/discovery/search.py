@@ -31,6 +31,8 @@ _CLEARLY = 3.0
 _KEPT = 0.5
 _MUCH = 0.33
 _MOST_OF_IT = 0.5
+# An effect below the threshold is added if it closes more than this part of the gap, by this evidence [nats].
+_NEARLY_ALL, _CERTAIN = 0.99, 100.0
 
 
 @dataclass(frozen=True)
@@ -262,11 +264,25 @@ class Search:
         def passed(s: Score) -> float:
             return min(s.evidence, promised[id(s.candidate)] if s.candidate.has_grid else np.inf)
 
-        good = [s for s in refitted if not s.reason and passed(s) > screened.threshold]
+        def enough(s: Score) -> bool:
+            return passed(s) > screened.threshold or self._leaves_noise(model, s, passed(s))
+
+        good = [s for s in refitted if not s.reason and enough(s)]
         one = next_effect(good)
         broken = [s.candidate for s in refitted if s.evidence < _KEPT * promised[id(s.candidate)]]
         two = self._two(model, screened, one, broken) if ahead else ()
         return two or ((one,) if one else ()), (*refitted, *rest), screened.threshold
+
+    def _leaves_noise(self, model: Model, score: Score, evidence: float) -> bool:
+        """Check that a refitted effect leaves next to nothing above the noise, by an evidence without doubt.
+
+        The surrogates of the threshold are what no candidate explains linearly. Of an effect that acts in few
+        moments, as a limit does, much of that is the effect itself.
+        """
+        if evidence < _CERTAIN:
+            return False
+        old, new = (self.acceptance.residual(t) for t in (model.theta, score.refitted))
+        return self.acceptance.closed(old, new) > _NEARLY_ALL
 
     def _two(
         self, model: Model, screened: Screen, one: Score | None, broken: list[cand.Candidate]

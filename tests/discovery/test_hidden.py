@@ -71,3 +71,11 @@ def test_nothing_is_seen_in_complete_models(case, tmp_path):
 def test_disturbances_are_shown(case, tmp_path):
     record = searched(case, tmp_path)
     assert judge.pointed_at(record), said(record)
+
+
+@pytest.mark.slow
+def test_a_limit_that_acts_in_few_moments_is_named(tmp_path):
+    """With other signs the residual reaches 3047 nats; the effect has 2016 on the linear screen."""
+    case = next(c for c in cases("test") if c.seed == 8159)
+    record = searched(case, tmp_path)
+    assert record["named"] == ["saturation"], said(record)
