@@ -44,6 +44,7 @@ def without(text: str, *lines: str) -> str:
     return text.replace("period = 0.001", "period = 0.002")
 
 
+@pytest.mark.slow
 def test_a_missing_delay_is_named_and_put_into_the_controller(tmp_path):
     """Among rivals that act on command and error; the corrected case has it where a case states it."""
     text = without(CASE, "delay = { guess = 0.005 }\n", COULOMB)
