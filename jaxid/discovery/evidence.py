@@ -21,6 +21,8 @@ _CORRELATED = 10
 _STRETCHES = 20
 # Ridge added to a normal matrix, relative to its diagonal.
 _RIDGE = 1e-9
+# Sum of squares below which a column is zero.
+_NOTHING = 1e-200
 # Probability that noise alone exceeds the threshold with any of the candidates.
 FALSE_POSITIVE = 1e-3
 
@@ -169,9 +171,14 @@ def _held_out_squares(
 
 
 def _others(gram: Float[np.ndarray, "block k k"]) -> Float[np.ndarray, "block k k"]:
-    """Sum products over all blocks except each, with a small ridge, since columns may be dependent."""
+    """Sum products over all blocks except each, with a small ridge, since columns may be dependent.
+
+    A column of zeros, for instance of a limit that nothing reaches, gets a ridge too: an inverse without one
+    overflows, and every evidence beside that column is lost.
+    """
     total = gram.sum(axis=0)
-    return total - gram + _RIDGE * np.diag(np.maximum(np.diag(total), 1e-300))
+    power = np.diag(total)
+    return total - gram + _RIDGE * np.diag(np.where(power > _NOTHING, power, 1.0))
 
 
 def partial_products(

@@ -41,6 +41,15 @@ def test_columns_beside_a_base(extra, offset):
     np.testing.assert_allclose(found, left(np.concatenate([COLUMNS, extra], axis=1), e), rtol=1e-6)
 
 
+def test_a_column_of_zeros_changes_nothing():
+    # For instance the slope by a limit that nothing reaches.
+    one = np.random.default_rng(4).standard_normal((len(BLOCKS), 1))
+    with_zeros = np.column_stack([COLUMNS, np.zeros(len(BLOCKS))])
+    first, second = (ev.Beside(base, RESIDUALS, BLOCKS) for base in (COLUMNS, with_zeros))
+    found = second.held_out(one, second.crossed(one))
+    assert found == pytest.approx(first.held_out(one, first.crossed(one)), rel=1e-9)
+
+
 def test_two_effects_beside_a_base():
     e, offsets = RESIDUALS[:, :1], (None, OFFSET, None)
     names = [SimpleNamespace(candidate=k) for k in range(3)]
