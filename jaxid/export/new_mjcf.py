@@ -10,9 +10,10 @@ import numpy as np
 
 from jaxid.export.exported import ExportedFile, JointLaws, notes_of_case, shown
 from jaxid.export.mjcf import DAMPING, JOINT_LAWS, SPRING, spring_of
-from jaxid.export.new_robot import NewRobot, comment, escaped, leader_of, leading_of, listed, numbers
+from jaxid.export.new_robot import NewRobot, comment, leader_of, leading_of
 from jaxid.export.shaft_tendons import ShaftTendons
 from jaxid.export.soft_friction import Softness
+from jaxid.export.xml_text import escaped, listed, numbers
 
 # Time step of the file [s].
 _STEP = 0.001

@@ -100,21 +100,6 @@ def leading_of(model: Mapping[str, Any]) -> tuple[int, ...]:
     return tuple(model["tree"]["leading"] or range(len(model["joints"])))
 
 
-def numbers(values: Any) -> str:
-    """Return numbers as XML holds them, to the last digit."""
-    return " ".join(repr(float(v) + 0.0) for v in np.ravel(values))
-
-
-def listed(values: Mapping[str, str]) -> str:
-    """Return attributes of an XML element."""
-    return " ".join(f'{name}="{escaped(value)}"' for name, value in values.items())
-
-
-def escaped(text: str) -> str:
-    """Return a text as an attribute of XML holds it."""
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
-
-
 def comment(stem: str, version: str, notes: Sequence[str]) -> str:
     """Return an XML comment that says who wrote a file, and what it does not hold."""
     lines = [

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.export.exported import ExportedFile, JointLaws, notes_of_case, shown
-from jaxid.export.new_robot import NewRobot, comment, escaped, leader_of, leading_of, listed, numbers
+from jaxid.export.new_robot import NewRobot, comment, leader_of, leading_of
+from jaxid.export.xml_text import escaped, listed, numbers
 
 # Effects that <dynamics> states, with their parameter, and its attributes.
 _LAWS = {"viscous_friction": "coefficient", "coulomb_friction": "level"}

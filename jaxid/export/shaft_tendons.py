@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from jaxid.export.soft_friction import Softness
-from jaxid.export.xml_text import XmlText
+from jaxid.export.xml_text import XmlText, listed
 
 # Attributes of a tendon, with the effect and parameter that each is.
 _ATTRIBUTES = {
@@ -65,18 +65,14 @@ class ShaftTendons:
 
 
 def _tendon(joints: list[str], ratios: list[float], values: dict[str, float], name: str, step: float) -> str:
-    listed = {"name": name, **{attribute: repr(value) for attribute, value in values.items()}}
+    head = {"name": name, **{attribute: repr(value) for attribute, value in values.items()}}
     if "frictionloss" in values:
-        listed |= {k: v for k, v in Softness.least(step).attributes().items() if v is not None}
+        head |= {key: value for key, value in Softness.least(step).attributes().items() if value is not None}
     if "stiffness" in values:
-        listed["springlength"] = "0"
-    parts = "".join(
-        f'<joint joint="{joint}" coef="{ratio!r}"/>'
-        for joint, ratio in zip(joints, ratios, strict=True)
-        if ratio
-    )
-    attributes = " ".join(f'{key}="{value}"' for key, value in listed.items())
-    return f"<fixed {attributes}>{parts}</fixed>"
+        head["springlength"] = "0"
+    turning = [(joint, ratio) for joint, ratio in zip(joints, ratios, strict=True) if ratio]
+    parts = "".join(f"<joint {listed({'joint': joint, 'coef': repr(ratio)})}/>" for joint, ratio in turning)
+    return f"<fixed {listed(head)}>{parts}</fixed>"
 
 
 def insert_tendons(text: XmlText, tendons: tuple[str, ...]) -> None:

@@ -1,11 +1,14 @@
-"""Changes of single attributes in the text of an XML file, all else left as it is."""
+"""Text of XML: elements that are written, and changes of attributes in a file, all else left as it is."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 from xml.parsers import expat
+
+import numpy as np
 
 
 @dataclass
@@ -136,6 +139,21 @@ class XmlText:
         for (start, end), new in sorted(edits.items(), reverse=True):
             out = out[:start] + new + out[end:]
         return out
+
+
+def numbers(values: Any) -> str:
+    """Return numbers as XML holds them, to the last digit."""
+    return " ".join(repr(float(v) + 0.0) for v in np.ravel(values))
+
+
+def listed(values: Mapping[str, str]) -> str:
+    """Return attributes of an XML element."""
+    return " ".join(f'{name}="{escaped(value)}"' for name, value in values.items())
+
+
+def escaped(text: str) -> str:
+    """Return a text as an attribute of XML holds it."""
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;")
 
 
 def _end_of_tag(content: bytes, at: int) -> int:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import equinox as eqx
 import jax
@@ -18,6 +19,7 @@ from jaxid.case.mjcf import read_mjcf
 from jaxid.case.urdf import read_urdf_tree
 from jaxid.cli import main
 from jaxid.commands.export import export
+from jaxid.export.shaft_tendons import ShaftTendons
 from jaxid.results.model_json import drives_json, robot_json
 from tests.export.test_other_targets import compiled, imported, in_c
 
@@ -229,3 +231,14 @@ def test_faults_leave_no_file(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "the case names no MJCF to change: a new one is written" in told
     assert "wrote joint 'joint1', joint 'joint2'" in told
+
+
+def test_names_of_joints_are_escaped_in_a_tendon():
+    """A name that XML would end early stays whole."""
+    joints = ['a "left" & <upper>', "b"]
+    effect = {"kind": "viscous_friction", "shaft": 1, "parameters": {"coefficient": 0.6}}
+    model = {"joints": joints, "shafts": [[-1.0, 2.0]], "effects": [effect]}
+    (text,) = ShaftTendons.of(model, 1e-3, joints).texts
+    tendon = ElementTree.fromstring(text)
+    assert [joint.get("joint") for joint in tendon] == joints
+    assert tendon.get("damping") == "0.6"
