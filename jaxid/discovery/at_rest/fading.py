@@ -1,7 +1,7 @@
 """Friction that fades just above rest, tried where the starts from rest show a break-away friction.
 
 Both delay a start. A search in forces leaves out the samples around a rest, in which they differ. The filter
-of `prediction_error` takes these samples too: its likelihood separates the two.
+of `prediction_error` takes samples much nearer to a rest: its likelihood separates the two.
 """
 
 from __future__ import annotations
