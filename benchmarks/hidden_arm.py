@@ -2,11 +2,11 @@
 
     python -m benchmarks.hidden_arm [-o DIR]
 
-The file states a wrong mass as well; the log is MuJoCo's, with torques. `jaxid discover` searches for what the
-file lacks. `jaxid identify` and MuJoCo's sysid fit a list that the user names: first what such files usually
-hold, then with springs as well. sysid simulates stretches of a quarter of a second, which start from the log.
-Each result is a file of MuJoCo. DIR/hidden_arm.md holds what these files state, how well they follow a log
-left out, the times, and what each tool says of what is missing.
+The file states a wrong mass as well; the log is MuJoCo's, with torques. `jaxid discover` searches for what is
+not in the file. `jaxid identify` and MuJoCo's sysid fit a list that the user names: first what such files
+usually hold, then with springs as well. sysid simulates stretches of a quarter of a second, which start from
+the log. Each result is a file of MuJoCo. DIR/hidden_arm.md holds what these files state, how well they follow
+a log left out, the times, and what each tool says of what is missing.
 """
 
 import argparse
@@ -273,9 +273,9 @@ def page(outcomes: list[Outcome]) -> str:
         "# An arm in MuJoCo of which the file lacks four things",
         "",
         f"Written by `python -m benchmarks.hidden_arm` on {date.today()}, at {commit_of(ROOT)}.",
-        f"The log has {SECONDS:g} s at {RATE} Hz with torques, by MuJoCo; its encoders have noise of 10 urad.",
-        f"The file states {BODIES['forearm']} kg for the forearm, {MASS} are true. Friction, damping, a rotor and",
-        "a spring are not in the file.",
+        f"The log has {SECONDS:g} s at {RATE} Hz with torques, by MuJoCo; noise of its encoders is 10 urad.",
+        f"The file states {BODIES['forearm']} kg for the forearm, {MASS} are true. Friction, damping, a",
+        "rotor and a spring are not in the file.",
         "",
         "| | true | " + " | ".join(o.heading for o in outcomes) + " |",
         "|---" * (2 + len(outcomes)) + "|",
@@ -301,9 +301,9 @@ def page(outcomes: list[Outcome]) -> str:
         row("time, of a processor", ["", *("{:.0f} s, {:.0f} s".format(*o.seconds) for o in outcomes)]),
         row("statement on what is missing", ["", *(o.words for o in outcomes)]),
         "",
-        f"The user's file is wrong by up to {100 * apart(user_file()):.2g} % in a torque of the bodies, and by",
-        f"{shown_rms(user_file())} on the log left out. Times include compiling. Behind ± stands half of sysid's",
-        "95 % interval. A springref without stiffness has no effect.",
+        f"The user's file is wrong by up to {100 * apart(user_file()):.2g} % in a torque of the bodies, and",
+        f"by {shown_rms(user_file())} on the log left out. Times include compiling. Behind ± stands half of",
+        "sysid's 95 % interval. A springref without stiffness has no effect.",
     ]
     return "\n".join(lines) + "\n"
 

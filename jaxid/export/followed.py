@@ -114,6 +114,15 @@ class Followed:
         moved = self.robot.motion(self.replay, Setting(softness=other))
         yield "creep that the exported file's dry friction leaves", rms(moved - self.after)
 
+    def without_creep(self) -> Float[np.ndarray, "time n"]:
+        """Return the position of the exported file at a short time step, dry friction as stiff as it can be.
+
+        Creep is in proportion to the time step: a tenth of it is left.
+        """
+        least = Softness.least(float(self.robot.model.opt.timestep) / FINER)
+        stiff = dict.fromkeys(self.robot.softness, least)
+        return self.robot.motion(self.replay, Setting(finer=FINER, softness=stiff))
+
     def time_step(self) -> tuple[str, np.ndarray]:
         """Return what the file's time step moves, as `lacks` does."""
         fine = self.robot.motion(self.replay, Setting(finer=FINER))

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxid.export.exported import ExportedFile
 from jaxid.export.followed import Followed, lacks_table, rms
+from jaxid.export.mujoco_run import FINER
 from jaxid.export.replayed import mujoco_robot
 from jaxid.results.aligned import aligned
 
@@ -30,6 +31,7 @@ class ServoReplay:
         before: Measured less simulated position of the user's file, (logs, n).
         after: That of the exported file.
         difference: Exported file in MuJoCo less jaxid's simulation, (logs, n).
+        without_creep: The same at a short time step, dry friction as stiff as it can be, (logs, n).
         lacks: Things that the file cannot hold: a sentence, and what each moves, (logs, n).
     """
 
@@ -39,6 +41,7 @@ class ServoReplay:
     before: Float[np.ndarray, "logs n"]
     after: Float[np.ndarray, "logs n"]
     difference: Float[np.ndarray, "logs n"]
+    without_creep: Float[np.ndarray, "logs n"]
     lacks: Mapping[str, Float[np.ndarray, "logs n"]]
 
     def __str__(self) -> str:
@@ -46,13 +49,19 @@ class ServoReplay:
             [f"{b:.3g} -> {a:.3g}" for b, a in zip(before, after, strict=True)]
             for before, after in zip(1e3 * self.before, 1e3 * self.after, strict=True)
         ]
-        apart = [[f"{x:.2g}" for x in row] for row in 1e3 * self.difference]
+        apart, stiff = (
+            [[f"{x:.2g}" for x in row] for row in 1e3 * sizes]
+            for sizes in (self.difference, self.without_creep)
+        )
         lines = [
             "replay by MuJoCo: RMS from the log, your file -> exported",
             self._table(changed),
             "",
             "exported file in MuJoCo less jaxid's simulation, RMS",
             self._table(apart),
+            "",
+            f"the same at a {FINER}th of the time step, which leaves dry friction a {FINER}th of its creep",
+            self._table(stiff),
         ]
         if self.lacks:
             worst = ((what, np.nanmax(sizes, axis=0)) for what, sizes in self.lacks.items())
@@ -96,5 +105,6 @@ def replay_servos(
         before=np.array([rms(f.log.position - f.before) for f in every]),
         after=np.array([rms(f.log.position - f.after) for f in every]),
         difference=np.array([rms(f.after - f.own) for f in every]),
+        without_creep=np.array([rms(f.without_creep() - f.own) for f in every]),
         lacks={what: np.array([one.get(what, none) for one in lacks]) for what in names},
     )
