@@ -102,6 +102,16 @@ def test_a_long_list_of_values_begins_with_what_is_known(fitted):
     assert page.count("<section") == page.count("</section>")
 
 
+def test_sums_of_inertias_and_vague_values_come_last(fitted):
+    data = identification_data(fitted)
+    one = replace(data.parameters[0], identifiable=True, value=2.0, std=0.01)
+    sums = [replace(one, name=f"inertia_xx[{k}]") for k in range(30)]
+    frictions = [replace(one, name=f"viscous_friction[{k}].coefficient") for k in range(1, 8)]
+    vague = [replace(one, name=f"first_moment_x[{k}]", std=3.0) for k in range(9)]
+    shown, _ = first_values(replace(data, parameters=(*vague, *sums, *frictions), derived=()))
+    assert [line["name"] for line in shown] == ["inertia_xx[0]", *(row.name for row in frictions)]
+
+
 def test_every_effect_has_words():
     for kind, cls in EFFECTS.items():
         assert cls.title, kind

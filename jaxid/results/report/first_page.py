@@ -76,16 +76,20 @@ def completeness(data: ReportData) -> dict | None:
 def first_values(data: ReportData) -> tuple[list[dict], int]:
     """Return the rows of values for the first page, and the number of those left out.
 
-    Of many, identifiable ones and those of found effects come first.
+    Of many, identifiable ones come first, then those of found effects, those that are not vague, and those of
+    effects, which a reader knows better than sums of inertias.
     """
     lines = parameter_lines((*data.parameters, *data.derived))
     if len(lines) <= MOST_VALUES:
         return lines, 0
     found = tuple(f"{e['kind']}" for e in data.effects)
-    order = sorted(
-        range(len(lines)),
-        key=lambda k: (not lines[k]["identifiable"], not lines[k]["name"].startswith(found or ("\0",)), k),
-    )
+
+    def rank(k: int) -> tuple:
+        line = lines[k]
+        is_found = line["name"].startswith(found or ("\0",))
+        return not line["identifiable"], not is_found, line["vague"], "." not in line["name"], k
+
+    order = sorted(range(len(lines)), key=rank)
     return [lines[k] for k in sorted(order[:FIRST_VALUES])], len(lines) - FIRST_VALUES
 
 

@@ -28,6 +28,8 @@ _MOST_INTERVALS = 6
 _INTERVAL = 1.96
 # Ratio of a gap to the measured signal beyond which its number says nothing.
 _MOST_RELATIVE = 10.0
+# Standard deviation over value from which a value is vague.
+_VAGUE = 0.1
 # Name of the gap in position.
 SIMULATED = "simulated position"
 # Weights up to this are omitted from the text of a combination.
@@ -462,4 +464,5 @@ def _parameter_line(row: ParameterRow) -> dict:
         "misspecified": _misspecified(row, scale),
         "unit": unit,
         "identifiable": row.identifiable and is_number(row.value),
+        "vague": not (is_number(row.value) and is_number(row.std) and row.std < _VAGUE * abs(row.value)),
     }
