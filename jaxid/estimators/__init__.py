@@ -290,7 +290,7 @@ def _power(session: Session) -> Steps[Estimate]:
     from jaxid.estimators.power import power_steps
 
     session.fit.log.need_every_encoder("power")
-    return power_steps(session.machine, session.fit.data)
+    return power_steps(session.machine, session.fit.data, session.fit.log)
 
 
 def _algebraic(session: Session) -> Steps[Estimate]:

@@ -30,8 +30,10 @@ from jaxid.arrays import Array
 from jaxid.dynamics.residuals import drive_ratio, integrate_internal_states
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.common.windowed import Kernels, weighed, weights_steps
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import linear_scale
+from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared, lasting
 from jaxid.machine import Machine
 from jaxid.model.balance import Balance
@@ -39,14 +41,8 @@ from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
-from jaxid.numerics.precision import assess
 from jaxid.simulation.force_balance import ForceData, sharpened
 
-# Share of the intervals that hold the truth, by `benchmarks.intervals`.
-_NARROW = (
-    "its standard deviations may be too small: 83 to 94 % of such 95 % intervals held the truth on simulated "
-    "axes and chains (benchmarks.intervals)"
-)
 # Least prominence of a peak of the speed, relative to the RMS speed.
 _HILL = 0.5
 # Length of a window over the mean length of a peak: four on its rise and four on its fall, half overlapping.
@@ -179,51 +175,52 @@ def power_and_columns(
     return e, jacobian
 
 
-def power(machine: Machine, data: Prepared) -> Estimate:
+def kernels_of(windows: PowerData) -> Kernels:
+    """Return the weights of the forces of all joints in the rows that count, see `power_residual`."""
+    data, length, joints = windows.data, 2 * windows.half, windows.data.q.shape[1]
+    by_sample = data.period * window((np.arange(length) + 0.5) / windows.half)
+    at, column = np.nonzero(windows.weight > 0)
+    starts = windows.first + at * windows.half
+    weight = np.asarray(windows.weight)[at, column]
+    speed = np.asarray(data.qd)[starts[:, None] + np.arange(length)]
+    values = weight[:, None, None] * by_sample * np.moveaxis(speed, 1, 2)
+    if windows.weight.shape[1] == joints:
+        values[column[:, None] != np.arange(joints)] = 0.0
+    return Kernels(values, starts)
+
+
+def power(machine: Machine, data: Prepared, log: Log | None = None) -> Estimate:
     """Fit the unknowns to balances of energy over windows by least squares.
 
     Args:
         machine: The machine.
         data: The prepared log, of which the filtered velocity is used and not the acceleration.
+        log: The log before preparation, for the noise of its readings; None: these count as exact.
 
     Returns:
-        The estimate; its covariance accounts for a coloured residual.
+        The estimate.
 
     Raises:
         InputError: If the log is too short for the number of windows that the unknowns need.
     """
-    return run_alone(power_steps(machine, data))
+    return run_alone(power_steps(machine, data, log))
 
 
-def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
+def power_steps(machine: Machine, data: Prepared, log: Log | None = None) -> Steps[Estimate]:
     """Run `power` as a generator of solve requests."""
     windows, unit = windows_of(machine, data)
     plant, parameters = sharpened(machine.plant, data), machine.parameters
     transform, damping = linear_scale(machine)
-    fit = yield SolveRequest(
-        _solve,
-        (
-            plant,
-            parameters.places,
-            windows,
-            parameters.guess,
-            transform,
-            parameters.bounds,
-            damping,
-        ),
-    )
+    options = (transform, parameters.bounds, damping)
 
-    rows = windows.weight > 0
-    theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)
-    jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
-    precision = assess(
-        parameters.names,
-        jacobian,
-        e,
-        np.asarray(rows),
-        float(unit * np.sqrt(rows.sum())),
-        np.where(theta != 0, theta, 1.0),
-    )
+    def solved(windows: PowerData, theta: Array) -> SolveRequest:
+        return SolveRequest(_solve, (plant, parameters.places, windows, theta, *options))
+
+    fit = yield solved(windows, parameters.guess)
+    rows = np.asarray(windows.weight > 0)
+    weight, covariance = yield from weights_steps(machine, log, data, kernels_of(windows), fit, rows, unit)
+    fit = yield solved(eqx.tree_at(lambda w: w.weight, windows, windows.weight * weight), fit.theta)
+    theta, e, precision = weighed(machine, fit, rows, weight, covariance, unit)
 
     converged = bool(fit.converged) and bool(np.all(np.isfinite(theta)))
     length = 2 * windows.half * data.period
@@ -237,10 +234,7 @@ def power_steps(machine: Machine, data: Prepared) -> Steps[Estimate]:
         residual=np.where(rows, e, np.nan),
         samples=int(rows.sum()),
         steps=int(fit.steps),
-        notes=(
-            f"{int(rows.sum())} windows of {length:.3g} s, half overlapping: four on a rise of speed",
-            _NARROW,
-        ),
+        notes=(f"{int(rows.sum())} windows of {length:.3g} s, half overlapping: four on a rise of speed",),
     )
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.signal
+import scipy.sparse
 from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array, library
@@ -33,7 +34,7 @@ _COMMON = 40
 # Kinds of covariance in results, and in words where its numbers come from.
 GAUSS_NEWTON, FULL_HESSIAN = "gauss_newton", "full_hessian"
 POSTERIOR, LAPLACE, ROUNDING = "posterior_draws", "laplace", "simulated_rounding"
-FISHER = "fisher_information"
+FISHER, WINDOWED = "fisher_information", "window_noise"
 # Matrices that a full Hessian stands in place of, in words.
 _PLAIN = {GAUSS_NEWTON: "the Gauss-Newton matrix", FISHER: "Fisher's information"}
 KINDS = {
@@ -42,6 +43,7 @@ KINDS = {
     POSTERIOR: "draws from the posterior and the colour of the residual",
     LAPLACE: "the Gauss-Newton matrix with the prior, and the colour of the residual",
     ROUNDING: "simulated rounding of the readings",
+    WINDOWED: "the noise and the friction at halts that each window holds",
     FISHER: "the Fisher information of the innovations, widened where these are coloured",
 }
 
@@ -341,6 +343,7 @@ def assess(
     hessian: Float[np.ndarray, "p p"] | None = None,
     crossed: bool = False,
     solved: Float[np.ndarray, "p p"] | None = None,
+    covariance: scipy.sparse.csr_array | None = None,
 ) -> Precision:
     """Return the precision of a least-squares fit under coloured noise, with its unidentifiable directions.
 
@@ -357,15 +360,18 @@ def assess(
             instruments.
         crossed: Whether the columns of the residual have common noise, such as a reading and the command
             that a loop computes from it; otherwise they count as independent.
+        covariance: Covariance of the residual at the samples that count, if it is known.
 
     Returns:
-        The precision. Each column of the residual gets an autoregressive noise model.
+        The precision. Without a known covariance each column of the residual gets an autoregressive noise
+        model.
     """
     if not names:
         return Precision(np.zeros((0, 0)), np.zeros(0, bool), [], np.zeros(0))
     rows = jacobian if counts.all() else np.where(counts[..., None], jacobian, 0.0)
-    flat, meat = rows.reshape(-1, len(names)), _of_gradient(rows, residual, counts, crossed)
-    return assess_from_sums(names, flat.T @ flat, meat, signal, scale, hessian, solved)
+    flat, meat = rows.reshape(-1, len(names)), _of_gradient(rows, residual, counts, crossed, covariance)
+    found = assess_from_sums(names, flat.T @ flat, meat, signal, scale, hessian, solved)
+    return found if covariance is None else replace(found, kind=WINDOWED)
 
 
 def _of_gradient(
@@ -373,8 +379,11 @@ def _of_gradient(
     residual: Float[np.ndarray, "time n"],
     counts: Bool[np.ndarray, "time n"],
     crossed: bool,
+    covariance: scipy.sparse.csr_array | None = None,
 ) -> Float[np.ndarray, "p p"]:
     """Return J'RJ, the covariance of the gradient, for a Jacobian that is zero where nothing counts."""
+    if covariance is not None:
+        return rows[counts].T @ (covariance @ rows[counts])
     meat = np.zeros((rows.shape[-1], rows.shape[-1]))
     noises = [NoiseModel.fit(e, c) for e, c in zip(residual.T, counts.T, strict=True)]
     for i, noise in enumerate(noises):
@@ -458,6 +467,7 @@ class Rows:
         counts: Mask of the samples that count, (time, n).
         signal: 2-norm of the measured signal that the residual belongs to.
         weight: Weight of the squared residual in the fit.
+        covariance: Covariance of the residual at the samples that count; None: it follows from its colour.
     """
 
     jacobian: Float[np.ndarray, "time n p"]
@@ -465,12 +475,14 @@ class Rows:
     counts: Bool[np.ndarray, "time n"]
     signal: float
     weight: float = 1.0
+    covariance: scipy.sparse.csr_array | None = None
 
     def matrices(self, norm: Float[np.ndarray, " p"], crossed: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Return J'J and J'RJ by the unknowns over `norm`, (p, p) each, R being the residual's covariance."""
         rows = np.where(self.counts[..., None], self.jacobian, 0.0) / norm
         flat = rows.reshape(-1, len(norm))
-        return flat.T @ flat, _of_gradient(rows, self.residual, self.counts, crossed)
+        meat = _of_gradient(rows, self.residual, self.counts, crossed, self.covariance)
+        return flat.T @ flat, meat
 
     @property
     def size(self) -> Float[np.ndarray, " p"]:
@@ -535,7 +547,8 @@ def assess_together(
     if len(logs) == 1:
         [log] = logs
         shape = (log.jacobian, log.residual, log.counts, log.signal)
-        return assess(names, *shape, scale, None if hessian is None else hessian / log.weight, crossed)
+        full = None if hessian is None else hessian / log.weight
+        return assess(names, *shape, scale, full, crossed, covariance=log.covariance)
     if not names:
         return Precision(np.zeros((0, 0)), np.zeros(0, bool), [], np.zeros(0))
     signal = float(np.sqrt(np.sum([log.weight * log.signal**2 for log in logs])))
@@ -550,7 +563,8 @@ def assess_together(
     for matrix in (normal, meat):
         matrix[dead] = 0.0
         matrix[:, dead] = 0.0
-    return _precision(names, normal, meat, norm, signal, hessian)
+    found = _precision(names, normal, meat, norm, signal, hessian)
+    return found if logs[0].covariance is None else replace(found, kind=WINDOWED)
 
 
 def _precision(

@@ -58,7 +58,7 @@ def position_density(
     rate, recipe = log.rate_hz, data.recipe
     f = np.linspace(0, rate / 2, 2049)[1:]
     sigma = position_noise(machine, log)
-    mass, damping, stiffness = (np.asarray(a) for a in _impedance(machine.plant, ForceData.of(data)))
+    mass, damping, stiffness = (np.asarray(a) for a in linearised_balance(machine.plant, ForceData.of(data)))
     w = 2 * np.pi * f[:, None, None]
     of_position, of_velocity, of_acceleration = (recipe.response(f, rate, k)[:, None, None] for k in range(3))
     impedance = _measured_joints(
@@ -128,7 +128,7 @@ def _measured_joints(impedance: np.ndarray, exact: np.ndarray, measured: tuple[b
 
 
 @kept_jit
-def _impedance(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
+def linearised_balance(plant: Plant, data: ForceData) -> tuple[Array, Array, Array]:
     """Linearise the balance at median position and RMS velocity: mass, damping and stiffness, (n, n)."""
     q, v = jnp.median(data.q, axis=0), jnp.sqrt(jnp.mean(data.qd**2, axis=0))
     u = jnp.median(data.force, axis=0)

@@ -21,6 +21,7 @@ from jaxid.arrays import Array
 from jaxid.dynamics.residuals import drive_ratio, integrate_internal_states
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.common.windowed import Kernels, weighed, weights_steps
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import linear_scale
 from jaxid.logs.log import Log
@@ -30,15 +31,9 @@ from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
-from jaxid.numerics.precision import assess
 from jaxid.simulation.force_balance import ForceData, sharpened
 
 # Length of a window in periods of the band edge; windows overlap by half. Shorter ones hold too little motion
-# Share of the intervals that hold the truth, by `benchmarks.intervals`.
-_NARROW = (
-    "its standard deviations are too small: 74 to 83 % of such 95 % intervals held the truth on simulated "
-    "axes and chains (benchmarks.intervals); inverse_dynamics has 90 to 94 %"
-)
 # to separate inertia from friction, longer ones too much drift of the noise.
 _WINDOW_PERIODS = 20
 # Largest fraction of a window for which the axis may rest.
@@ -208,6 +203,24 @@ def windows_without_rest(
     return length, rows
 
 
+def kernels_of(length: int, rows: Bool[np.ndarray, "window n"], period: float) -> Kernels:
+    """Return the weights of a force in the rows that count, see `weak_residual`.
+
+    The double integral of t^2 f up to the end T of a window is that of (T - t) t^2 f.
+
+    Args:
+        length: Number of samples in a window.
+        rows: Mask of the rows that count.
+        period: Sampling time [s].
+    """
+    t = period * np.arange(length)
+    weight = (t[-1] - t) * t**2 * period * 12 / t[-1] ** 4
+    window, joint = np.nonzero(rows)
+    values = np.zeros((len(window), rows.shape[1], length))
+    values[np.arange(len(window)), joint] = weight
+    return Kernels(values, window * (length // 2))
+
+
 def algebraic(machine: Machine, log: Log, data: Prepared) -> Estimate:
     """Fit the unknowns to windows of iterated integrals by least squares.
 
@@ -231,31 +244,18 @@ def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimat
     plant, arrays = sharpened(machine.plant, data), ForceData.of(data)
     length, rows = windows_without_rest(machine, log, data)
     parameters = machine.parameters
-    fit = yield SolveRequest(
-        _solve,
-        (
-            plant,
-            parameters.places,
-            arrays,
-            log.position,
-            length,
-            np.asarray(rows, dtype=float),
-            parameters.guess,
-            *linear_scale(machine),
-            parameters.bounds,
-        ),
-    )
-    theta, e = np.asarray(fit.theta), np.asarray(fit.residual).reshape(rows.shape)
-    jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
+    options = (*linear_scale(machine), parameters.bounds)
+
+    def solved(weight: np.ndarray, theta: Array) -> SolveRequest:
+        problem = (plant, parameters.places, arrays, log.position, length, weight, theta)
+        return SolveRequest(_solve, (*problem, *options))
+
+    fit = yield solved(rows.astype(float), parameters.guess)
     force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))
-    precision = assess(
-        parameters.names,
-        jacobian,
-        e,
-        rows,
-        force * np.sqrt(rows.sum()),
-        np.where(theta != 0, theta, 1.0),
-    )
+    kernels = kernels_of(length, rows, data.period)
+    weight, covariance = yield from weights_steps(machine, log, data, kernels, fit, rows, force)
+    fit = yield solved(weight, fit.theta)
+    theta, e, precision = weighed(machine, fit, rows, weight, covariance, force)
 
     converged = bool(fit.converged)
     return Estimate(
@@ -268,5 +268,5 @@ def algebraic_steps(machine: Machine, log: Log, data: Prepared) -> Steps[Estimat
         residual=np.where(rows, e, np.nan),
         samples=int(rows.sum()),
         steps=int(fit.steps),
-        notes=(f"{int(rows.sum())} windows of {length * log.period:.3g} s, half overlapping", _NARROW),
+        notes=(f"{int(rows.sum())} windows of {length * log.period:.3g} s, half overlapping",),
     )
