@@ -323,6 +323,12 @@ class Precision:
             white = white * np.where(self.identifiable, np.diag(whole) / np.diag(self.covariance), 1.0)
         return replace(self, covariance=whole, equivalent_variance=white)
 
+    def at_least(self, std: Float[np.ndarray, " p"]) -> Precision:
+        """Return the precision with standard deviations of at least these, (p,); NaN sets no limit."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = std / self.std
+        return self.widened(np.where(np.isfinite(factor), np.maximum(factor, 1.0), 1.0))
+
     def beside(self, std: float) -> Precision:
         """Return the precision with one more parameter, whose standard deviation is known independently."""
         p = len(self.covariance)

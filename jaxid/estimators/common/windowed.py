@@ -64,8 +64,10 @@ def weights_steps(
     fit: Minimum,
     counts: Bool[np.ndarray, "window k"],
     force: float,
-) -> Steps[tuple[Float[np.ndarray, "window k"], scipy.sparse.csr_array]]:
+) -> Steps[tuple[Float[np.ndarray, "window k"], scipy.sparse.csr_array | None]]:
     """Compute the weights of rows from a fit without them, see `weights_of_rows`.
+
+    They are equal, and the covariance is None, if the noise at this fit is no finite number.
 
     Args:
         machine: The machine.
@@ -78,8 +80,10 @@ def weights_steps(
     """
     theta = np.asarray(fit.theta)
     if not (np.all(np.isfinite(theta)) and np.isfinite(float(fit.cost))):
-        return counts.astype(float), scipy.sparse.csr_array(scipy.sparse.eye_array(int(counts.sum())))
+        return counts.astype(float), None
     covariance = yield from row_covariance_steps(machine.with_estimate(theta), data, kernels, log)
+    if not np.all(np.isfinite(covariance.data)):
+        return counts.astype(float), None
     return weights_of_rows(_rows_of(fit, counts, force), covariance)
 
 
@@ -88,7 +92,7 @@ def weighed(
     fit: Minimum,
     counts: Bool[np.ndarray, "window k"],
     weight: Float[np.ndarray, "window k"],
-    covariance: scipy.sparse.csr_array,
+    covariance: scipy.sparse.csr_array | None,
     force: float,
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "window k"], Precision]:
     """Return estimates, residual without weights and precision of a fit with weights.
@@ -134,7 +138,7 @@ def row_covariance_steps(
     weights = kernels.matrix(time)
     variance = np.square(force_noise(machine, data) * machine.gain)
     of_force = np.sqrt(np.asarray(machine.plant.applied(variance, n)))
-    parts = [_scaled(weights, of_force), weights @ errors_at_halts(data, np.asarray(friction.level))]
+    parts = [_scaled(weights, of_force), weights @ errors_at_halts(data, friction)]
     if log is not None:
         matrices = yield SolveRequest(linearised_balance, (machine.plant, arrays))
         by_ratio = [np.asarray(x) / np.asarray(friction.ratio)[:, None] for x in matrices]

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse
 
+from jaxid.estimators.algebraic.windows import kernels_of as algebraic_kernels
 from jaxid.estimators.algebraic.windows import windows_and_columns, windows_without_rest
 from jaxid.estimators.common.shapes import phase_starts, shape_starts
+from jaxid.estimators.common.windowed import Kernels, row_covariance_steps, weights_of_rows
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import linear_scale
+from jaxid.estimators.power import kernels_of as power_kernels
 from jaxid.estimators.power import power_and_columns, windows_of
 from jaxid.estimators.several.descent import Descent, Model, descent_steps
 from jaxid.estimators.several.parts import Part, Scale, by_log
@@ -36,12 +40,35 @@ class Equations:
         arguments: Its first arguments.
         counts: Mask of the rows that count, (rows, n).
         signal: 2-norm of the measured signal that the residual belongs to.
+        kernels: Weights of the force in the rows that count, if they are integrals over windows.
+        factor: Weight of each row, (rows, n); None: one for those that count.
+        covariance: Covariance of the weighted rows that count; None: not known.
     """
 
     function: Callable
     arguments: tuple
     counts: np.ndarray
     signal: float
+    kernels: Kernels | None = None
+    factor: np.ndarray | None = None
+    covariance: scipy.sparse.csr_array | None = None
+
+    def rows(self, part: Part, e: np.ndarray, columns: np.ndarray, width: int, weight: float) -> Rows:
+        """Return the weighted rows of a log, with the columns of `width` unknowns of all logs."""
+        factor = np.where(self.counts, 1.0 if self.factor is None else self.factor, 0.0)
+        e = np.where(self.counts, np.asarray(e) * factor, 0.0)
+        columns = np.where(self.counts[..., None], np.asarray(columns) * factor[..., None], 0.0)
+        wide = part.widened(columns, width)
+        return Rows(wide, e, self.counts, self.signal, weight, self.covariance)
+
+    def weighed_steps(self, part: Part, theta: np.ndarray, rows: Rows) -> Steps[Equations]:
+        """Return the equations weighed by the variance of each row at values of the unknowns of all logs."""
+        assert self.kernels is not None, "these equations have windows"
+        covariance = yield from row_covariance_steps(part.at(theta), part.data, self.kernels, part.log)
+        if not np.all(np.isfinite(covariance.data)):
+            return self
+        factor, covariance = weights_of_rows(rows, covariance)
+        return replace(self, factor=factor, covariance=covariance)
 
 
 def inverse_dynamics_steps(machine: Machine, parts: Sequence[Part]) -> Steps[Estimate]:
@@ -67,7 +94,8 @@ def power_steps(machine: Machine, parts: Sequence[Part]) -> Steps[Estimate]:
         counts = np.asarray(windows.weight > 0)
         arguments = (plant, part.machine.parameters.places, windows)
         signal = float(unit * np.sqrt(counts.sum()))
-        equations.append(Equations(power_and_columns, arguments, counts, signal))
+        kernels = power_kernels(windows)
+        equations.append(Equations(power_and_columns, arguments, counts, signal, kernels))
     return (yield from least_squares_steps(machine, "power", parts, equations))
 
 
@@ -80,7 +108,8 @@ def algebraic_steps(machine: Machine, parts: Sequence[Part]) -> Steps[Estimate]:
         plant, data = sharpened(part.machine.plant, part.data), part.data
         arguments = (plant, part.machine.parameters.places, ForceData.of(data), part.log.position, length)
         force = float(np.sqrt(np.mean((data.force - data.force.mean(axis=0)) ** 2)))
-        equations.append(Equations(windows_and_columns, arguments, counts, force * np.sqrt(counts.sum())))
+        signal, kernels = force * np.sqrt(counts.sum()), algebraic_kernels(length, counts, data.period)
+        equations.append(Equations(windows_and_columns, arguments, counts, signal, kernels))
     return (yield from least_squares_steps(machine, "algebraic", parts, equations))
 
 
@@ -106,9 +135,7 @@ def least_squares_steps(
             for part, own, weight in zip(parts, equations, weights, strict=True):
                 arguments = (*own.arguments, theta[part.index])
                 e, columns = yield SolveRequest(own.function, arguments)
-                e = np.where(own.counts, np.asarray(e), 0.0)
-                columns = np.where(own.counts[..., None], np.asarray(columns), 0.0)
-                logs.append(Rows(part.widened(columns, p), e, own.counts, own.signal, float(weight)))
+                logs.append(own.rows(part, e, columns, p, float(weight)))
             return summed(logs, scale.slope(theta))
 
         options = {"tolerance": (_TOLERANCE, 0.0), "max_steps": _MOST, "damping": damping}
@@ -120,17 +147,33 @@ def least_squares_steps(
     for at in [theta, *phase_starts(machine, theta), *shape_starts(machine, theta)]:
         ends.append((yield from fit(scale.inward(at), first)))
     best = min(ends, key=lambda end: np.nan_to_num(end.model.cost, nan=np.inf))
-    found, _ = yield from descended_steps(fit, best.x, first)
-    return _estimate(machine, method, parts, scale, found)
+    found, weights = yield from descended_steps(fit, best.x, first)
+    if found.model.finite and all(own.kernels is not None for own in equations):
+        at, logs = scale.outward(found.x)[0], found.model.content
+        for k, (part, own, rows) in enumerate(zip(parts, list(equations), logs, strict=True)):
+            equations[k] = yield from own.weighed_steps(part, at, rows)
+        found, _ = yield from descended_steps(fit, found.x, weights)
+    factors = [own.counts if own.factor is None else own.factor for own in equations]
+    return _estimate(machine, method, parts, scale, found, factors)
 
 
-def _estimate(machine: Machine, method: str, parts: Sequence[Part], scale: Scale, found: Descent) -> Estimate:
+def _estimate(
+    machine: Machine,
+    method: str,
+    parts: Sequence[Part],
+    scale: Scale,
+    found: Descent,
+    factors: Sequence[np.ndarray],
+) -> Estimate:
     logs = found.model.content
     theta, guess = scale.outward(found.x)[0], machine.parameters.guess
     natural = np.where(guess != 0, guess, 1.0)
     precision = assess_together(machine.parameters.names, logs, natural)
     converged = found.converged and bool(np.all(np.isfinite(theta)))
-    residual = [np.where(log.counts, log.residual, np.nan) for log in logs]
+    residual = [
+        np.where(log.counts, log.residual / np.where(log.counts, factor, 1.0), np.nan)
+        for log, factor in zip(logs, factors, strict=True)
+    ]
     return Estimate(
         method=method,
         machine=machine.with_estimate(theta),
