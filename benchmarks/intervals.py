@@ -1,10 +1,11 @@
 """Share of 95 % intervals that hold the truth, by machine, loop and sensor: logs of the exact steppers.
 
-    python -m benchmarks.intervals [--runs N] [--cell NAME]... [--method M]... [-o DIR]
+    python -m benchmarks.intervals [--runs N] [--first SEED] [--cell NAME]... [--method M]... [-o DIR]
 
-Truth, motion and noise are drawn anew in each run. Without --method the fit is the one that `jaxid identify`
-chooses. Runs are written to DIR/intervals.jsonl as they end; a second call goes on from there, and rewrites
-the table DIR/intervals.md from all of them.
+Truth, motion and noise are drawn anew in each run, by its seed. Runs from another first seed have a line of
+their own in the table: seeds that nobody looked at while a method was written. Without --method the fit is
+the one that `jaxid identify` chooses. Runs are written to DIR/intervals.jsonl as they end; a second call goes
+on from there, and rewrites the table DIR/intervals.md from all of them.
 """
 
 import argparse
@@ -29,7 +30,9 @@ WITHIN_PRIOR = "[within_prior]\nprior = 0.5\n"
 CELLS = [f"{machine}/{loop}/{sensor}" for machine in MACHINES for loop in LOOPS for sensor in SENSORS]
 
 
-def run_chunk(cell: str, method: str | None, seeds: list[int], commit: str) -> list[dict[str, Any]]:
+def run_chunk(
+    cell: str, method: str | None, seeds: list[int], first: int, commit: str
+) -> list[dict[str, Any]]:
     """Return a record for each seed: deviations of the printed values over their std, or the failure."""
     machine, loop, sensor = cell.split("/")
     cases, logs, truths = [], [], []
@@ -47,7 +50,7 @@ def run_chunk(cell: str, method: str | None, seeds: list[int], commit: str) -> l
         seconds = (time.perf_counter() - begin) / len(seeds)
     records = []
     for seed, fit, true in zip(seeds, fits, truths, strict=True):
-        record: dict[str, Any] = {"cell": cell, "asked": method or "chosen", "seed": seed}
+        record: dict[str, Any] = {"cell": cell, "asked": method or "chosen", "seed": seed, "first": first}
         record |= {"seconds": seconds, "commit": commit}
         if isinstance(fit, Exception):
             record |= {"failed": str(fit)}
@@ -76,15 +79,15 @@ def table(records: list[dict[str, Any]]) -> str:
         "Truth, motion and noise are drawn in each run. Efficiency is the bound of Cramer and Rao, by the",
         "innovations of the Kalman filter at the truth, over the mean squared error.",
         "",
-        "| cell | method | runs | failed | values | 95 % holds | range | largest | efficiency | not printed "
-        "| s a fit | commit |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| cell | method | seeds | runs | failed | values | 95 % holds | range | largest | efficiency "
+        "| not printed | s a fit | commit |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     bounds = {(r["cell"], r["seed"]): r["bound"] for r in records if "bound" in r}
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for record in records:
-        groups.setdefault((record["cell"], record["asked"]), []).append(record)
-    for (cell, asked), of in sorted(groups.items()):
+        groups.setdefault((record["cell"], record["asked"], record.get("first", 0)), []).append(record)
+    for (cell, asked, first), of in sorted(groups.items()):
         z = np.array([v for r in of for v in r.get("z", {}).values()])
         methods = sorted({r["method"] for r in of if "method" in r})
         name = ", ".join(methods) + (" (chosen)" if asked == "chosen" else "")
@@ -105,8 +108,9 @@ def table(records: list[dict[str, Any]]) -> str:
         efficiency = f"{1 / np.mean(ratios**2):.2f}" if ratios.size else "-"
         commits = ", ".join(sorted({r["commit"] for r in of}))
         seconds = np.median([r["seconds"] for r in of])
+        seeds = f"{first}-{max(r['seed'] for r in of)}"
         lines.append(
-            f"| {cell} | {name} | {len(of)} | {failed} | {z.size} | {hold} | "
+            f"| {cell} | {name} | {seeds} | {len(of)} | {failed} | {z.size} | {hold} | "
             f"{share[0]:.1f}-{share[1]:.1f} % | {largest} | {efficiency} | {blind} | "
             f"{seconds:.2f} | {commits} |"
         )
@@ -119,6 +123,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first run")
     parser.add_argument("--cell", choices=CELLS, action="append", help="default: all")
     parser.add_argument("--method", action="append", help="default: the one that identify chooses")
     parser.add_argument("-o", metavar="DIR", type=Path, default=HERE)
@@ -130,9 +135,10 @@ def main() -> int:
 
     for method in options.method or [None]:
         for cell in options.cell or CELLS:
-            missing = [s for s in range(options.runs) if (cell, method or "chosen", s) not in done]
+            seeds = range(options.first, options.first + options.runs)
+            missing = [s for s in seeds if (cell, method or "chosen", s) not in done]
             for at in range(0, len(missing), CHUNK):
-                new = run_chunk(cell, method, missing[at : at + CHUNK], commit)
+                new = run_chunk(cell, method, missing[at : at + CHUNK], options.first, commit)
                 append_runs(stored, new)
                 records += new
                 print(f"{cell} {method or 'chosen'}: {at + len(new)} of {len(missing)}", file=sys.stderr)

@@ -121,11 +121,6 @@ def _doubts_of_output_error(machine: Machine) -> list[str]:
             "the loop is simulated with an encoder that rounds, which makes the cost rough: the fit may end "
             "several standard deviations off, use prediction_error"
         ]
-    if machine.controller is not None and machine.gain.size > 1:
-        return [
-            "noise that goes round the loop shakes the dry friction of coupled joints: on chains 89 % of "
-            "such 95 % intervals held the truth (benchmarks.intervals); prediction_error holds its share"
-        ]
     return []
 
 

@@ -28,7 +28,7 @@ from jaxid.estimators.output_fit import (
     output_residuals,
 )
 from jaxid.estimators.output_profile import profile_steps
-from jaxid.estimators.round_the_loop import shift_steps
+from jaxid.estimators.round_the_loop import shift_steps, with_lasting_errors
 from jaxid.estimators.several.parts import Part, by_log
 from jaxid.estimators.several.sums import shares, stacked
 from jaxid.estimators.several.weights import disagreement
@@ -305,13 +305,13 @@ def _estimate(
         precision = precision.widened(widening(precision, *stacked(moving), lengths))
     precision = precision.first(machine.parameters.names)
     lasting = std_under_misspecification(*stacked(moving))[:p]
-    if _shaken(fit):
-        precision = precision.at_least(lasting)
 
     details: dict[str, Any] = {}
     remarks = list(hessian_notes(precision, hessian))
     theta, more = end.theta, []
-    if fit.pushed:
+    if fit.shaken:
+        precision, more = with_lasting_errors(precision, lasting)
+    elif fit.pushed:
         theta, precision, more = yield from _pushed(fit, end, moving, precision, command_noise)
     elif len(moving) > 1:
         theta, precision, more = yield from _without_noise(fit, end, moving, precision)
@@ -340,17 +340,6 @@ def _estimate(
         details=details | kept_delay(first.part.machine, first.numerics),
         std_misspecified=lasting,
     )
-
-
-def _shaken(fit: OutputFit) -> bool:
-    """Check that noise which goes round the loop shakes the dry friction of several joints of one log.
-
-    A joint that halts a little sooner, or once more, moves the others for as long as their loops take: an
-    error that lasts longer than the colour of the residual remembers. With several logs it is simulated, see
-    `_without_noise`.
-    """
-    [output, *others] = fit.outputs
-    return not others and output.looped and output.part.machine.gain.size > 1
 
 
 def _without_noise(

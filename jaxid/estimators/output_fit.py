@@ -386,6 +386,12 @@ class OutputFit:
         """True if the logged force drives the simulation of every log."""
         return not any(o.looped or o.part.log.passive for o in self.outputs)
 
+    @property
+    def shaken(self) -> bool:
+        """True if one log is fitted whose noise goes round the loop of several joints."""
+        [output, *others] = self.outputs
+        return not others and output.looped and output.part.machine.gain.size > 1
+
     def noise_limited(self, logs: Sequence[Rows]) -> bool:
         """Check that what is left of every log is at most a few times the noise of its readings."""
         for output, log in zip(self.outputs, logs, strict=True):

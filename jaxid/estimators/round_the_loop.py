@@ -18,11 +18,13 @@ from jaxid.estimators.simulated_output import output_residual
 from jaxid.model.plant import Plant
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.precision import Rows
+from jaxid.numerics.precision import Precision, Rows
 from jaxid.simulation.replay import Replay
 
 # Pairs of simulated noise.
 _PAIRS = 32
+# Standard deviations that are wider by less than this factor are no news.
+_SLIGHTLY = 1.1
 
 
 @dataclass(frozen=True)
@@ -90,3 +92,29 @@ def shift_steps(
     steps, scatter = even.steps(), odd.steps()
     covariance = np.atleast_2d(np.cov(steps.T)) / pairs
     return Shift(steps.mean(axis=0), covariance, scatter.T @ scatter / pairs)
+
+
+def with_lasting_errors(
+    precision: Precision, lasting: Float[np.ndarray, " p"]
+) -> tuple[Precision, list[str]]:
+    """Return the precision of a fit of several joints in a loop, and a note if it is clearly wider.
+
+    Noise that goes round the loop shakes the dry friction of every joint. One that halts a little sooner, or
+    once more, moves the others for as long as their loops take: an error that lasts longer than a model of
+    the residual's colour remembers.
+
+    Args:
+        precision: Precision by the colour of the residual.
+        lasting: Standard deviations by the scores of long stretches of the log, (p,).
+    """
+    wider = precision.at_least(lasting)
+    with np.errstate(invalid="ignore"):
+        ratio = wider.std / precision.std
+    most = float(np.max(ratio[np.isfinite(ratio)], initial=1.0))
+    if most < _SLIGHTLY:
+        return wider, []
+    note = (
+        "noise that goes round the loop shakes the dry friction of the joints, an error that lasts: the "
+        f"standard deviations are those of long stretches of the log, up to {most:.2g} times as large"
+    )
+    return wider, [note]

@@ -137,13 +137,13 @@ def row_covariance_steps(
     friction = yield SolveRequest(dry_friction, (sharpened(machine.plant, data), arrays, rest))
     weights = kernels.matrix(time)
     variance = np.square(force_noise(machine, data) * machine.gain)
-    of_force = np.sqrt(np.asarray(machine.plant.applied(variance, n)))
-    parts = [_scaled(weights, of_force), weights @ errors_at_halts(data, friction)]
+    of_force = np.sqrt(np.abs(np.asarray(machine.plant.applied(variance, n))))
+    parts = [_scaled(weights, of_force, time), weights @ errors_at_halts(data, friction)]
     if log is not None:
         matrices = yield SolveRequest(linearised_balance, (machine.plant, arrays))
         by_ratio = [np.asarray(x) / np.asarray(friction.ratio)[:, None] for x in matrices]
         of_readings = weights @ _force_of_readings(by_ratio, time, data.period, log.integrated)
-        parts.append(_scaled(of_readings, position_noise(machine, log)))
+        parts.append(_scaled(of_readings, position_noise(machine, log), time))
     return scipy.sparse.csr_array(sum(x @ x.T for x in parts))
 
 
@@ -158,18 +158,18 @@ def _force_of_readings(
         period: Sampling time [s].
         integrated: Whether the readings are velocities; the position is then as good as exact.
     """
-    one = scipy.sparse.eye_array(time)
-    slope = scipy.sparse.diags_array([-0.5, 0.5], offsets=[-1, 1], shape=(time, time)) / period
-    bend = scipy.sparse.diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(time, time)) / period**2
+    one, after = scipy.sparse.eye_array(time), scipy.sparse.eye_array(time, k=1)
+    slope, bend = 0.5 * (after - after.T) / period, (after + after.T - 2 * one) / period**2
     derivatives = [slope, one] if integrated else [bend, slope, one]
     terms = zip(impedance, derivatives, strict=not integrated)
     return scipy.sparse.csr_array(sum(scipy.sparse.kron(scipy.sparse.csr_array(x), d) for x, d in terms))
 
 
-def _scaled(weights: scipy.sparse.csr_array, std: Float[np.ndarray, " n"]) -> scipy.sparse.csr_array:
+def _scaled(
+    weights: scipy.sparse.csr_array, std: Float[np.ndarray, " n"], time: int
+) -> scipy.sparse.csr_array:
     """Multiply the columns of each joint by its standard deviation."""
-    time = weights.shape[1] // len(std)
-    return scipy.sparse.csr_array(weights @ scipy.sparse.diags_array(np.repeat(std, time)))
+    return scipy.sparse.csr_array(weights @ scipy.sparse.kron(np.diag(std), scipy.sparse.eye_array(time)))
 
 
 def weights_of_rows(
@@ -238,4 +238,5 @@ def _beyond(
         return least, freedom
     if excess(most) >= 0:
         return most, freedom
-    return float(np.exp(scipy.optimize.brentq(lambda x: excess(np.exp(x)), *np.log([least, most])))), freedom
+    found = scipy.optimize.brentq(lambda x: excess(np.exp(x)), np.log(least), np.log(most))
+    return float(np.exp(found)), freedom  # pyright: ignore[reportCallIssue, reportArgumentType] (stub)
