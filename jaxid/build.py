@@ -7,6 +7,7 @@ from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import Array
@@ -115,8 +116,9 @@ def _sensor(case: Case, controller: Controller | None, plant: Plant) -> Sensor:
 
 
 @kept_jit
-def _identifiable(sensors: InertialSensors, plant: Plant, q: Array, readings: Array, zero: Array) -> Array:
-    return sensors.fused(plant, q, readings, zero, zero)[2]
+def _identifiable(sensors: InertialSensors, plant: Plant, q: Array) -> Array:
+    zero = jnp.zeros_like(q)
+    return sensors.fused(plant, q, sensors.read(plant, q, zero, zero), zero, zero)[2]
 
 
 def _ticks_held(rate: float, controller: Controller | None, where: str) -> int:
@@ -145,15 +147,13 @@ def _inertial(case: Case, controller: Controller | None, plant: Plant) -> Inerti
     out = InertialSensors(tuple(sensors), tuple(known), math.lcm(*holds))
 
     # Three random positions show whether the readings determine the motion.
-    zero = np.zeros(plant.joints)
     rng = np.random.default_rng(0)
     try:
         positions = [plant.any_motion(rng)[0] for _ in range(3)]
     except InputError as error:
         raise InputError(f"{case.where}, [plant.parameters]: {error}") from error
     for q in positions:
-        readings = out.read(plant, q, zero, zero)
-        if not bool(_identifiable(out, plant, q, readings, zero)):
+        if not bool(_identifiable(out, plant, q)):
             what = "the gyroscopes" if not out.accelerates else "gyroscopes and accelerometers"
             raise InputError(
                 f"{what} do not determine the motion of every joint",

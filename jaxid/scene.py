@@ -20,6 +20,7 @@ from jaxid.files import write_whole
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.references import make_reference
 from jaxid.schema import stated
@@ -254,9 +255,7 @@ def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
     """Refuse an arm that some motion moves without kinetic energy: its acceleration would be infinite."""
     if not plant.coupled:
         return
-    q = jnp.asarray(position, dtype=jnp.float64)
-    zero = jnp.zeros_like(q)
-    mass = np.asarray(jax.jacfwd(lambda a: plant.inertial(q, zero, a))(zero))
+    mass = np.asarray(_mass_matrix(plant, np.asarray(position, dtype=np.float64)))
     scale = 1 / np.sqrt(np.maximum(np.diagonal(mass), 1e-300))
     if np.diagonal(mass).min() <= 0 or np.linalg.eigvalsh(mass * np.outer(scale, scale))[0] < 1e-12:
         joint = int(np.argmin(np.diagonal(mass))) + 1
@@ -265,6 +264,12 @@ def _refuse_massless(plant: Plant, position: np.ndarray, where: str) -> None:
             where=where,
             hint="give the links mass and inertia that bodies can have",
         )
+
+
+@kept_jit
+def _mass_matrix(plant: Plant, q: Array) -> Array:
+    zero = jnp.zeros_like(q)
+    return jax.jacfwd(lambda a: plant.inertial(q, zero, a))(zero)
 
 
 def refuse_impossible(plant: Plant, positions: np.ndarray, where: str, period: float | None = None) -> None:

@@ -39,7 +39,7 @@ from experiments.five_bar_robot import GAINS, LOOK, PERIOD, case_text, driven, r
 
 # %%
 folder = Path(tempfile.mkdtemp())
-SECONDS = 2.5
+SECONDS = 2.0
 
 
 def run(name, law):

@@ -95,7 +95,7 @@ def bodies_of(
         return Bodies(found, own, 0.0)
 
     asked, final = LinkSums.of(plant, start, rotors)
-    x = np.asarray(jax.vmap(log_cholesky)(jnp.asarray(fuller(start[asked.heavy])))).ravel()
+    x = np.asarray(_coordinates(fuller(start[asked.heavy]))).ravel()
     asked = LinkSums(*map(jnp.asarray, asked))
     error = np.asarray(_rest(x, asked))
     for _ in range(_STEPS):
@@ -170,6 +170,10 @@ class LinkSums(NamedTuple):
         return cls(start, heavy, mapping, links, kinds, wanted, size), final
 
 
+_coordinates = jax.jit(jax.vmap(log_cholesky))
+
+
+@jax.jit
 def _links(x: Array, asked: LinkSums) -> Array:
     """Return all links from the coordinates of those that have mass."""
     heavy = jax.vmap(of_log_cholesky)(x.reshape(-1, 10))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -59,8 +60,13 @@ def moved(axes: Float[Array, "3 3"], origin: Float[Array, " 3"]) -> Float[np.nda
     Source:
         Khalil & Dombre (2002), section 9.3: its columns are lambda_1 to lambda_10.
     """
+    return np.asarray(_rows_moved(axes, origin)).T
+
+
+@jax.jit
+def _rows_moved(axes: Float[Array, "3 3"], origin: Float[Array, " 3"]) -> Float[Array, "10 10"]:
     place = jnp.eye(4).at[:3, :3].set(axes).at[:3, 3].set(origin)
-    return np.asarray(ten_parameters(place @ pseudo_inertia(jnp.eye(10)) @ place.T)).T
+    return ten_parameters(place @ pseudo_inertia(jnp.eye(10)) @ place.T)
 
 
 def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:

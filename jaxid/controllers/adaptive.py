@@ -14,6 +14,7 @@ from jaxid.arrays import Array
 from jaxid.controllers.base import Path, Tick
 from jaxid.controllers.computed_torque import FeedForward
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.kept import kept_jit
 
 # A law is given its estimator, and imports none: `RealTime` of `jaxid.estimators.recursive.real_time`, with
 # the memory and the estimate of `jaxid.estimators.recursive.recursion`.
@@ -202,7 +203,7 @@ class Adaptive(FeedForward):
         return (middle, velocity, acceleration, command), ready
 
 
-@eqx.filter_jit
+@kept_jit
 def _along(law: Adaptive, path: Path, driven: tuple[int, ...]) -> tuple[Float[Array, " p"], Float[Array, ""]]:
     """Return the mean square of each unknown's column, and the RMS of the force, along a reference."""
     step = max(1, -(-len(path.reference) // _INSTANTS))

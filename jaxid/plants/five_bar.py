@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -147,8 +148,7 @@ class FiveBar(WithLinks):
 
     def impossible(self, q: Float[np.ndarray, "time n"]) -> tuple[int, str] | None:
         reach = self.length[3:]
-        every = jnp.asarray(q, dtype=jnp.float64)
-        sine = np.asarray(jax.vmap(lambda q: _sine(self._elbows(q)[1], reach))(every))
+        sine = np.asarray(self._sines(np.asarray(q, dtype=np.float64)))
         rows = np.flatnonzero(~(sine > SINGULAR))
         if not len(rows):
             return None
@@ -157,10 +157,14 @@ class FiveBar(WithLinks):
         if sine[row] >= 0:
             fault = "bring the distal links into one line, a singular configuration"
             return row, f"joints at [{shown}] rad {fault}"
-        elbow = np.asarray(self._elbows(every[row])[1])
+        elbow = np.asarray(self._elbows(jnp.asarray(q[row], dtype=jnp.float64))[1])
         apart = float(np.linalg.norm(elbow[1] - elbow[0]))
         lengths = f"elbows {apart:.4g} m apart, distal links of {reach[0]:.4g} and {reach[1]:.4g} m"
         return row, f"joints at [{shown}] rad are out of reach: {lengths}"
+
+    @eqx.filter_jit
+    def _sines(self, q: Float[Array, "time 2"]) -> Float[Array, " time"]:
+        return jax.vmap(lambda q: _sine(self._elbows(q)[1], self.length[3:]))(q)
 
     def joint_positions(self, tool: Float[np.ndarray, " 2"]) -> Float[Array, " 2"]:
         return self.inverse(tool)
