@@ -35,8 +35,8 @@ class Machine:
         hold: Course of the command between samples.
         reference_hold: Course of a logged reference between samples, where the log is slower than the loop.
         unknown_reference: Reference with unknowns, for logs without a reference; None: it is known.
-        load: Known force beside that of the drives in the loop, behind the limit of the command, at the
-            samples of a log and by drive, (time, m) [N or N m]; None: there is none.
+        load: Known forces in the loop that the plant takes behind those of its drives, at the samples of a
+            log, (time, loads) [N or N m]; None: there are none. See `jaxid.plants.loaded_axis`.
     """
 
     plant: Plant
@@ -49,7 +49,7 @@ class Machine:
     hold: str = "zero_order"
     reference_hold: str = "band_limited"
     unknown_reference: UnknownReference | None = None
-    load: Float[np.ndarray, "time m"] | None = None
+    load: Float[np.ndarray, "time loads"] | None = None
 
     @property
     def hold_period(self) -> float | None:

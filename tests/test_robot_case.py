@@ -87,7 +87,7 @@ def test_servos_that_follow_a_reference_need_no_force(folder):
     assert set(case.controller.unknown) == {"kp", "kd", "delay"}
 
 
-def test_a_search_of_several_servos_without_a_force_is_refused_at_once(tmp_path):
+def test_a_search_of_servos_and_links_without_a_force_is_refused_at_once(tmp_path):
     inertial = '<inertial pos="0 0 0.05" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>'
     link = '<body pos="0 0 0.1"><joint name="{n}" axis="0 1 0"/>' + inertial
     servos = "".join(f'<position joint="{n}" kp="20" kv="1"/>' for n in "abc")
@@ -100,7 +100,8 @@ def test_a_search_of_several_servos_without_a_force_is_refused_at_once(tmp_path)
         columns |= {f"q_{n}": np.sin(k * t), f"q_ref_{n}": np.sin(k * t + 0.1)}
     log = write_csv(tmp_path / "log.csv", columns)
     made = RobotCase.of(str(file), [str(log)], search=True)
-    with pytest.raises(InputError, match="takes one joint, and the case has 3"):
+    made.tables["plant"]["unknown"] = [*made.tables["plant"]["unknown"], "base"]
+    with pytest.raises(InputError, match="joint by joint, which these 3 joints do not allow"):
         discover(made.tables, str(log))
 
 

@@ -36,7 +36,8 @@ def add(commands: Commands) -> None:
         "--max-effects",
         metavar="N",
         type=int,
-        help="most effects to add; default: 5, or two a joint if that is more",
+        help="most effects to add; default: 5, or two a joint if that is more. Of an arm's servos without a "
+        "force: at each joint",
     )
     add_numerics(parser)
     parser.add_argument(

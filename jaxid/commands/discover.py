@@ -15,6 +15,7 @@ from jaxid.consistency.absent import acts_by_position
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.naming import Found, named_at_rest
 from jaxid.discovery.final import final_machine, machine_with
+from jaxid.discovery.in_loop.by_joint import explore_by_joint
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.in_loop.search import explore_within
 from jaxid.discovery.in_loop.unforced import explore_unforced
@@ -28,6 +29,7 @@ from jaxid.discovery.together import add_together
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_force, need_known_controller, need_known_reference
+from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
@@ -81,7 +83,8 @@ def discover(
         case: The case, its file, or a dict with its tables.
         log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
         validate: Logs that must confirm each effect, beside those of the case.
-        max_effects: Largest number of effects to add. None: five, or two a joint of an arm if that is more.
+        max_effects: Largest number of effects to add, without a force at each joint of an arm. None: five, or
+            two a joint of an arm if that is more.
         refit: Whether the parameters are refitted in simulation; if not, they are those of inverse dynamics.
         experiments: Whether experiments are designed that separate rival effects. None: unless joints are
             coupled, as in an arm, whose simulation takes minutes to compile for it.
@@ -128,6 +131,8 @@ def explore(
     asked, chosen = max_effects, max_effects is None
     max_effects = _EFFECTS if max_effects is None else max_effects
     if session.machine.unforced(session.fit.log):
+        if stands_apart(session.machine, parts_of(session)):
+            return explore_by_joint(session, max_effects=max_effects, progress=progress)
         _need_one_servo(session)
         return explore_unforced(session, max_effects=max_effects, progress=progress)
     need_force(session, "a search of a log with a force")
@@ -252,15 +257,18 @@ def _experiments(
 
 
 def _need_one_servo(session: Session) -> None:
-    """Refuse a search of several servos without a force, whose loop would be simulated for hours.
+    """Refuse a search of several servos at once without a force, whose loop would be simulated for hours.
 
     Raises:
-        InputError: If the machine is an arm of several joints.
+        InputError: If the machine is an arm of several joints, which cannot be searched one by one.
     """
     joints = session.machine.plant.joints
     if session.machine.plant.coupled and joints > 2:
-        hint = 'fit the servos by identify; for a search state one joint as kind = "axis"'
-        what = f"a search without a force takes one joint, and the case has {joints}"
+        hint = (
+            "each joint needs a servo (pd or cascade_pd), a command and an encoder, and each unknown must be "
+            'of one servo or joint: take "base" or "all" out of unknown'
+        )
+        what = f"a search without a force goes joint by joint, which these {joints} joints do not allow"
         raise InputError(what, where=session.case.where, hint=hint)
 
 

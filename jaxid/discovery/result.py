@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,6 +78,7 @@ class Discovery(FitResult):
         noise_floor: RMS force residual that the sensors' noise causes in the band, by joint.
         proposals: Experiments that distinguish effects which explain this log equally well.
         unseen: Reason why break-away friction was not searched for; empty if it was.
+        joints: Searches of the joints of an arm, each alone, by joint; empty: all were searched at once.
     """
 
     session: Session
@@ -91,6 +93,7 @@ class Discovery(FitResult):
     noise_floor: np.ndarray
     proposals: tuple[Proposal, ...] = ()
     unseen: str = ""
+    joints: Mapping[int, Discovery] = field(default_factory=dict)
 
     @property
     def kinds(self) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax.numpy as jnp
 
 from jaxid.arrays import Array
@@ -170,29 +169,6 @@ class LoadFriction(Effect):
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
         return [{"coefficient": 0.0}, {"coefficient": 0.1}]
-
-    def without_links(self, links: Array, period: float, tick: float) -> Effect:
-        numbers = {"links": links, "period": period, "late": 0.5 * tick / period}
-        own = {name: jnp.asarray(value) for name, value in numbers.items()}
-        return GearFriction(port=self.port, coefficient=self.coefficient, back=self.back, **own)
-
-
-class GearFriction(LoadFriction):
-    """Friction of the gear of a joint alone, whose drive's force counts without that of the links beside it.
-
-    Args:
-        links: Force of the links at the samples of a log, (time,) [N m or N].
-        period: Sampling time of the log [s].
-        late: Part of a sample after which the links' force of a tick of the loop is taken.
-    """
-
-    links: Array = eqx.field(kw_only=True)
-    period: Array = eqx.field(kw_only=True)
-    late: Array = eqx.field(kw_only=True)
-
-    def act(self, x: Signals, state: None) -> Action:
-        links = jnp.interp(x.t / self.period + self.late, jnp.arange(self.links.size), self.links)
-        return super().act(eqx.tree_at(lambda s: s.u, x, x.u - links), state)
 
 
 @register("asymmetric_viscous")

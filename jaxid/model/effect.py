@@ -223,21 +223,6 @@ class Effect(eqx.Module):
         """Check that the class delays the command: simulated loops then remember past commands."""
         return cls.command_delay is not Effect.command_delay
 
-    def without_links(self, links: Array, period: float, tick: float) -> Effect:
-        """Return the effect for a joint that is simulated without the links beside it.
-
-        Args:
-            links: Force of these links at the samples of a log, (time,) [N m or N].
-            period: Sampling time of the log [s].
-            tick: Period of the joint's loop [s].
-        """
-        return self
-
-    @classmethod
-    def knows_links(cls) -> bool:
-        """Check that the class leaves out the force of links beside the joint by itself."""
-        return cls.without_links is not Effect.without_links
-
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
         """Return the values from which a search starts, one dictionary per start.

@@ -6,6 +6,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from jaxid.results import as_json, as_text
+from jaxid.results.by_joint import joint_rows
 from jaxid.results.parameters import html_table
 
 if TYPE_CHECKING:
@@ -27,9 +28,11 @@ def identification_html(result: Identification) -> str:
 def discovery_html(result: Discovery) -> str:
     """Return the verdict, the parameters and the steps of a discovery."""
     effects = f": {', '.join(e.label for e in result.effects)}" if result.effects else ""
-    steps = as_text.step_rows(as_json.discovery_json(result))
+    content = as_json.discovery_json(result)
+    by_joint = joint_rows(content)
     caption = f"{result.verdict.replace('_', ' ')}{effects}"
-    return _findings(result) + _parameters(result, caption) + html_table(steps)
+    joints = html_table(by_joint) if by_joint else ""
+    return _findings(result) + joints + _parameters(result, caption) + html_table(as_text.step_rows(content))
 
 
 def check_html(result: Check) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxid.files import found_case_file, json_text, signal_csv, write_results
 from jaxid.model.unknowns import in_loop, leaf, several_places
+from jaxid.results.by_joint import joints_json
 from jaxid.results.found_case import case_text, changed_in_python
 from jaxid.results.model_json import joint_name, model_json
 from jaxid.results.parameters import Covariance
@@ -339,6 +340,12 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
     judged = slice(fits, None) if len(after) > fits else slice(0, fits)
     machine = result.session.machine
     measured = np.flatnonzero(result.session.fit.log.measured).tolist()
+    motion = {
+        "unit": machine.unit_by_joint("position", None if len(measured) > 1 else measured),
+        "before": _worst(before[judged], "simulation.rms"),
+        "after": _worst(after[judged], "simulation.rms"),
+        **_position_floor(result.session),
+    }
 
     return {
         "verdict": result.verdict,
@@ -364,13 +371,9 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
                 "before": _worst(before[judged], "force.relative"),
                 "after": _worst(after[judged], "force.relative"),
             },
-            "simulation": {
-                "unit": machine.unit_by_joint("position", None if len(measured) > 1 else measured),
-                "before": _worst(before[judged], "simulation.rms"),
-                "after": _worst(after[judged], "simulation.rms"),
-                **_position_floor(result.session),
-            },
+            "simulation": motion,
         },
+        **({"joints": joints_json(result, motion)} if result.joints else {}),
         "parameters": {
             k: v
             for k, v in parameters_json(result.after, incomplete=result.model_complete is False).items()
@@ -406,16 +409,23 @@ def turned_down(result: Discovery, most: int = 3) -> list[str]:
             "effects at rest, or at constant speed, may show in the simulated loop: state `[within_prior] "
             "prior`, the relative error of the guesses, and effects are searched for there"
         )
-    last = [s for s in steps if s.added is None and s.dropped is None][-1]
-    refused = [s for s in last.scores if s.reason and s.evidence > last.threshold]
-    for score in refused[:most]:
-        name, nats = score.candidate.label, score.evidence
-        lines.append(f"{name} was not added, at {nats:.0f} nats: {score.reason}")
+    for own in result.joints.values() or [result]:
+        lines += _refusals(own, most)
     if not session.machine.plant.designs_experiments and not result.proposals:
         tied = [e.label for e in result.effects if e.alternatives]
         missing = f"no experiment was designed to separate {', '.join(tied)} from rivals"
         lines += [f"{missing}: --experiments does, in minutes"] if tied else []
     return lines
+
+
+def _refusals(result: Discovery, most: int) -> list[str]:
+    """Return the reasons for the best candidates that a search did not add at its end."""
+    steps = [r.step for r in result.rounds]
+    last = [s for s in steps if s.added is None and s.dropped is None][-1]
+    refused = [s for s in last.scores if s.reason and s.evidence > last.threshold]
+    return [
+        f"{s.candidate.label} was not added, at {s.evidence:.0f} nats: {s.reason}" for s in refused[:most]
+    ]
 
 
 def step_json(r: Any, plant: Plant) -> dict[str, Any]:

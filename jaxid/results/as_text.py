@@ -11,6 +11,7 @@ from jaxid.logs.seen import sights_of
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
 from jaxid.results.aligned import aligned
+from jaxid.results.by_joint import joint_rows
 from jaxid.results.parameters import lines_of
 from jaxid.results.precision import precision_lines, ratio_rows
 from jaxid.results.report.numbers import with_std
@@ -199,6 +200,8 @@ def discovery_table(result: Discovery) -> str:
         at = f" at joint '{named['joint_name']}'" if named else ""
         lines.append(f"effect:  {effect.label}{at} (evidence {effect.score.evidence:.0f} nats{alternatives})")
     lines += [_EVIDENCE_WORDS] if result.effects else []
+    by_joint = joint_rows(content)
+    lines += ["", aligned(by_joint)] if by_joint else []
     lines += [f"experiment: {e['text']}" for e in content["experiments"]]
 
     parameters = _parameters_text(result)

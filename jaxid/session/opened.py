@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from jaxtyping import Float
+
 from jaxid.case.case import Case
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import LogLike
@@ -31,6 +34,7 @@ class OpenedLog:
         reference_hold: Course of the reference between samples that is stated for this log only; None: that
             of the machine.
         own: Values that hold in this log only; None: there are none.
+        load: Known forces along this log, see `jaxid.machine.Machine`; None: there are none.
     """
 
     name: str
@@ -39,12 +43,13 @@ class OpenedLog:
     disturbance: Disturbance | str | None
     reference_hold: str | None = None
     own: OwnValues | None = None
+    load: Float[np.ndarray, "time loads"] | None = None
 
     def machine(self, machine: Machine) -> Machine:
         """Return a machine with the values, the disturbance and the course of the reference of this log."""
         hold = self.reference_hold or machine.reference_hold
         own = machine if self.own is None else self.own.machine(machine)
-        return replace(own, disturbance=self.disturbance, reference_hold=hold)
+        return replace(own, disturbance=self.disturbance, reference_hold=hold, load=self.load)
 
 
 @dataclass(frozen=True)

@@ -206,7 +206,8 @@ def closed_loop(
         sensor: Sensor that the controller reads; None: exact readings.
         noise: Standard normal numbers for the noise of the positions and, if there are more
             columns, of the measured commands and the inertial sensors; None: no noise.
-        load: Known force beside that of the drives, held over each tick [N or N m]; None: there is none.
+        load: Known forces that the plant takes behind those of its drives, held over each tick [N or N m];
+            None: there are none.
 
     Returns:
         The trajectory, one row per tick.
@@ -223,7 +224,8 @@ def closed_loop(
     held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
     past = jnp.broadcast_to(held, (drive.longest_delay + 1, held.size))
     x0 = State(position, velocity, plant.initial_states(held))
-    advance = drive.stepper(plant, x0, (held,) if drive.longest_delay == 0 else (held, held))
+    on_plant = held if load is None else jnp.concatenate([held, load[0]])
+    advance = drive.stepper(plant, x0, (on_plant,) * (1 if drive.longest_delay == 0 else 2))
 
     inertial, m = sensor.inertial, drive.gain.size
 
@@ -251,7 +253,7 @@ def closed_loop(
         u, memory = controller.command(seen, memory, disturbance)
         ends, past = _delayed_force(plant, drive, u, past)
         if beside is not None:
-            ends = tuple(force + beside for force in ends)
+            ends = tuple(jnp.concatenate([force, beside]) for force in ends)
         new = advance(x, ends, t)
         if last is not None:
             assert noise is not None, "a command is measured only with noise"

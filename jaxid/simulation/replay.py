@@ -84,7 +84,7 @@ class Replay(eqx.Module):
         restart: Flags, positions and velocities of segments (open loop).
         every: Number of ticks per sample of the log.
         follow: Matrix from positions of joints with an encoder to positions of all at rest, (n, k).
-        load: Known force beside that of the drives at every tick (closed loop); None: there is none.
+        load: Known forces behind those of the drives at every tick (closed loop); None: there are none.
     """
 
     drive: Drive

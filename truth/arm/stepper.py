@@ -4,7 +4,7 @@ Moreau's midpoint step: friction impulses lie within their levels and bring a jo
 found by projected Gauss-Seidel sweeps. Mass matrix and the other forces are Pinocchio's, halfway.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -92,20 +92,25 @@ def stopped(free, mobility, most) -> np.ndarray:
     return v
 
 
-def followed(arm: Arm, reference, *, rate: float, kp, kd, step: float = 1e-4) -> dict[str, np.ndarray]:
-    """Run a PD loop from rest, without noise of sensors; return q, qd and u, (time, n).
+def followed(
+    arm: Arm, reference, *, rate: float, kp, kd, step: float = 1e-4, gear=0.0, read=lambda q: q
+) -> dict[str, np.ndarray]:
+    """Run a PD loop from rest; return the readings q, the speeds qd and the torques u, (time, n).
 
     u = kp (r - q) + kd (r' - q'), both differenced backwards, held until the next tick.
 
     reference: at every tick, (ticks, n) [rad]; rate: of the ticks [Hz]; kp [N m/rad], kd [N m s/rad]; step:
-    of integration [s].
+    of integration [s]; gear: dry friction of each joint in proportion to the torque of its drive, one a
+    joint; read: reading of the encoders at a position, which the loop sees.
     """
     links, steps = arm.model(), round(1 / rate / step)
     q, v = reference[0].copy(), np.zeros_like(reference[0])
-    was, rows = (reference[0], q), []
+    was, rows = (reference[0], read(q)), []
     for r in reference:
-        u = kp * (r - q) + kd * rate * ((r - was[0]) - (q - was[1]))
-        rows.append((q, v, u))
-        was = r, q
-        q, v = advance(arm, links, q, v, u, 1 / rate / steps, steps)
+        seen = read(q)
+        u = kp * (r - seen) + kd * rate * ((r - was[0]) - (seen - was[1]))
+        rows.append((seen, v, u))
+        was = r, seen
+        rubbing = replace(arm, coulomb=arm.coulomb + gear * np.abs(u))
+        q, v = advance(rubbing, links, q, v, u, 1 / rate / steps, steps)
     return {k: np.array(x) for k, x in zip(("q", "qd", "u"), zip(*rows, strict=True), strict=True)}

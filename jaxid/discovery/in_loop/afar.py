@@ -17,12 +17,33 @@ from jaxtyping import Float
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.in_loop.model_fit import ModelFit
 
-# Points in simulation, of all starts of a candidate together and at least at each; those from which fits
-# begin, their first steps, and those that are fitted to the end.
-_POINTS, _LEAST = 512, 16
-_BEGUN, _FIRST, _ENDED = 32, 6, 8
+# Least points in simulation at each start of a candidate, and first steps of the fits that begin there.
+_LEAST, _FIRST = 16, 6
 # Factors on the strength of a candidate of either sign.
 _FACTORS = (-1.0, -0.1, 0.1, 1.0)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """The number of starts that a candidate gets far from a model.
+
+    Args:
+        points: Points in simulation, of all its starts together.
+        begun: Points from which fits begin.
+        ended: Fits of them that go on to the end.
+        ahead: Candidates of which so many fits go on; of the others one does.
+    """
+
+    points: int = 512
+    begun: int = 32
+    ended: int = 8
+    ahead: int = 5
+
+
+# MANY: about guesses of a user, which may be several times off. FEW: about values of a fit that began at
+# those of a balance, which is linear in the unknowns.
+MANY = Effort()
+FEW = Effort(points=64, begun=8, ended=2, ahead=3)
 
 
 @dataclass(frozen=True)
@@ -35,10 +56,12 @@ class Afar:
             values.
         starts: Function that returns the starts of candidates by kind and port, at the scales of a machine
             near the guesses.
+        effort: The number of points and fits.
     """
 
     points: Callable[[Sequence[cand.Candidate], np.ndarray, int], np.ndarray]
     starts: Callable[[], dict[tuple[str, int], np.ndarray]]
+    effort: Effort = MANY
 
     def begun(
         self,
@@ -67,7 +90,7 @@ class Afar:
         signed = any(free[k].sign == "free" for k in last.index[last.amplitude])
         variants = list(itertools.product(starts, _FACTORS if signed else (1.0,)))
         # A power of two, as sequences of low discrepancy have it.
-        count = 2 ** int(np.log2(max(_POINTS / len(variants), _LEAST)))
+        count = 2 ** int(np.log2(max(self.effort.points / len(variants), _LEAST)))
         groups = []
         for start, factor in variants:
             at = theta.copy()
@@ -80,7 +103,8 @@ class Afar:
         order = np.argsort(squares, kind="stable")
         # Half of them the best of all, the others the best at each start.
         _, first = np.unique(group[order], return_index=True)
-        chosen = [*order[: _BEGUN // 2], *order[np.sort(first)], *order[_BEGUN // 2 :]]
-        ends, squares = fit.fit(points[list(dict.fromkeys(chosen))[:_BEGUN]], moving, steps=_FIRST)
-        best = np.argsort(squares, kind="stable")[:_ENDED]
+        begun = self.effort.begun
+        chosen = [*order[: begun // 2], *order[np.sort(first)], *order[begun // 2 :]]
+        ends, squares = fit.fit(points[list(dict.fromkeys(chosen))[:begun]], moving, steps=_FIRST)
+        best = np.argsort(squares, kind="stable")[: self.effort.ended]
         return ends[best], squares[best]

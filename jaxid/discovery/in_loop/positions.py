@@ -39,9 +39,8 @@ _SPRUNG, _TURN = 4, 0.25
 _RENEWALS = 2
 # Delays beside that of a fit from which it is tried again, in rows of the log.
 _DELAYS = (-1.0, -0.5, -0.25, 0.25, 0.5, 1.0)
-# Squared residual, relative to the noise's, beyond which candidates are fitted from afar too, and number of
-# those that are fitted from many starts to the end.
-_FAR, _AHEAD = 1.5, 5
+# Squared residual, relative to the noise's, beyond which candidates are fitted from afar too.
+_FAR = 1.5
 # Part of the motion that integration leaves wrong in any model.
 NUMERICS = 1e-5
 
@@ -377,8 +376,9 @@ class LoopSearch(Search):
         begun = in_threads(self._begun, [(model, c) for c in rest])
         # A candidate that is not ahead by then is fitted from its best start only.
         order = np.argsort([squares[0] for _, squares in begun], kind="stable")
+        ahead = self.afar.effort.ahead
         calls = [
-            (model, rest[i], begun[i][0][: None if k < _AHEAD else 1], screened) for k, i in enumerate(order)
+            (model, rest[i], begun[i][0][: None if k < ahead else 1], screened) for k, i in enumerate(order)
         ]
 
         scores = {id(s.candidate): s for s in screened.scores}

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from jaxid.discovery.candidates import Candidate, CandidateModel, View
 from jaxid.discovery.final import final_machine, machine_with
-from jaxid.discovery.in_loop.afar import Afar
+from jaxid.discovery.in_loop.afar import MANY, Afar, Effort
 from jaxid.discovery.in_loop.positions import JoinedLoops, Loops, LoopSamples, LoopSearch, PositionDomain
 from jaxid.discovery.result import Discovery, Round
 from jaxid.discovery.search import Model, Step
@@ -70,8 +70,30 @@ def explore_unforced(session: Session, *, max_effects: int, progress: Callable[[
     """
     progress("fitting the declared model")
     before = run_alone(steps_of("output_error", session))
+    return explored_from(session, before, max_effects=max_effects, progress=progress)
+
+
+def explored_from(
+    session: Session,
+    before: Estimate,
+    *,
+    max_effects: int,
+    progress: Callable[[str], None],
+    effort: Effort = MANY,
+) -> Discovery:
+    """Search logs without a force from a fit of the declared model.
+
+    Args:
+        session: Case and logs.
+        before: The fit.
+        max_effects, progress: See `explore_unforced`.
+        effort: Number of starts far from the fits of incomplete models.
+
+    Raises:
+        InputError: If the loop cannot be simulated.
+    """
     fitted, base = at_scale(before)
-    search = _search(session, fitted, progress)
+    search = _search(session, fitted, effort, progress)
     steps = search.run(max_effects)
     alternatives = search.alternatives(steps)
     final, effects = final_machine(fitted, search, alternatives, steps)
@@ -83,11 +105,13 @@ def explore_unforced(session: Session, *, max_effects: int, progress: Callable[[
     progress("simulating")
     old = gaps(before.machine, session.runs)
     new = gaps(after.machine, session.runs) if effects else old
-    verdict = "found" if effects else _without_effects(session, before, old)
+    verdict = "found"
+    if not effects:
+        verdict = verdict_without_effects(bool(open_joints(session, before.machine, old)))
     return Discovery(
         session=session,
         verdict=verdict,
-        where=None if verdict == "nothing_missing" else _where(session.fits, old),
+        where=None if verdict == "nothing_missing" else where_in_time(session.fits, old),
         effects=effects,
         rounds=_rounds(search, steps, old, new),
         before=before,
@@ -133,7 +157,9 @@ def loop_machine(estimate: Estimate) -> tuple[Machine, int | None]:
     return estimate.machine, estimate.machine.parameters.names.index(relative["to"])
 
 
-def _search(session: Session, machine: Machine, progress: Callable[[str], None]) -> LoopSearch:
+def _search(
+    session: Session, machine: Machine, effort: Effort, progress: Callable[[str], None]
+) -> LoopSearch:
     """Return the search for the effects that a fitted machine lacks."""
     first = session.fit.machine(machine)
     log = session.fit.log
@@ -192,7 +218,7 @@ def _search(session: Session, machine: Machine, progress: Callable[[str], None])
             *[samples(run) for run in session.validations],
         ),
         coarse=coarse,
-        afar=Afar(far, scaled),
+        afar=Afar(far, scaled, effort),
     )
     return search
 
@@ -260,11 +286,22 @@ def _refitted(session: Session, final: Machine, base: int | None) -> Estimate:
     return with_free_scale(held, machine, group, base)
 
 
-def _without_effects(session: Session, estimate: Estimate, found: tuple[Gap, ...]) -> str:
-    """Return the verdict if nothing was added: whether what is left of the fitted logs is noise."""
+def open_joints(session: Session, machine: Machine, found: Sequence[Gap]) -> set[int]:
+    """Return the joints, from 0, at which a machine leaves more than noise of the fitted logs.
+
+    Args:
+        session: Case and logs.
+        machine: The fitted machine.
+        found: Its gaps, those of the fitted logs first.
+    """
     pairs = zip(session.fits, found, strict=False)
-    left = [r for run, gap in pairs for r in position_residuals(estimate.machine, run, gap.simulation)]
-    return "unexplained" if any(r.complete is False for r in left) else "nothing_missing"
+    left = [r for run, gap in pairs for r in position_residuals(machine, run, gap.simulation)]
+    return {r.joint for r in left if r.complete is False}
+
+
+def verdict_without_effects(unexplained: bool) -> str:
+    """Return the verdict of a search that added nothing."""
+    return "unexplained" if unexplained else "nothing_missing"
 
 
 def _rounds(
@@ -288,7 +325,7 @@ def _rounds(
     return tuple(out)
 
 
-def _where(runs: Sequence[OpenedLog], found: Sequence[Gap]) -> Where | None:
+def where_in_time(runs: Sequence[OpenedLog], found: Sequence[Gap]) -> Where | None:
     """Return the log and time in which the position that the declared model leaves is largest."""
     seen = [
         (run, gap.simulation) for run, gap in zip(runs, found, strict=False) if gap.simulation is not None

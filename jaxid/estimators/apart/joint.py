@@ -26,8 +26,8 @@ from jaxid.machine import Machine
 from jaxid.model.effect import Effect
 from jaxid.model.unknowns import CONTROLLER, Free, Parameters
 from jaxid.numerics.kept import kept_jit
-from jaxid.plants.axis import Axis
 from jaxid.plants.link_tree import LinkTree
+from jaxid.plants.loaded_axis import LoadedAxis
 from jaxid.sensors.encoder import Sensor
 
 # Unknown inertias of the rotors among the parameters of a tree.
@@ -47,6 +47,7 @@ class JointAlone:
         index: Number of each of its unknowns among those of the arm, (own,).
         links: Mean inertia of the links about the joint [kg m^2 or kg], a part of its machine's.
         ratio: Inertia at the joint for one of its rotor, the square of its gear.
+        others: Logs that are not fitted.
     """
 
     joint: int
@@ -55,6 +56,7 @@ class JointAlone:
     index: np.ndarray
     links: float
     ratio: float
+    others: tuple[Part, ...] = ()
 
     def of_arm(self, own: Float[np.ndarray, " own"]) -> Float[np.ndarray, " own"]:
         """Return values of the joint's unknowns as those of the arm: a rotor without the links."""
@@ -72,7 +74,20 @@ class JointAlone:
     @property
     def moves(self) -> bool:
         """True if the reference of the joint moves in any log."""
-        return any(part.log.reference is not None and np.ptp(part.log.reference) > 0 for part in self.parts)
+        return any(map(_moves, self.parts))
+
+    @property
+    def in_motion(self) -> JointAlone:
+        """The joint along those logs alone in which its reference moves."""
+        kept, others = (tuple(filter(_moves, parts)) for parts in (self.parts, self.others))
+        return replace(self, parts=kept, others=others)
+
+    def with_estimate(self, own: Float[np.ndarray, " own"]) -> JointAlone:
+        """Return the joint with these values of its unknowns, which are also the new guesses."""
+        parts, others = (
+            tuple(replace(part, machine=part.at(own)) for part in some) for some in (self.parts, self.others)
+        )
+        return replace(self, machine=self.machine.with_estimate(own), parts=parts, others=others)
 
 
 def stands_apart(machine: Machine, parts: Sequence[Part]) -> bool:
@@ -90,10 +105,6 @@ def stands_apart(machine: Machine, parts: Sequence[Part]) -> bool:
         return False
     if len(plant.driven(plant.joints)) < plant.joints or plant.shafts or machine.parameters.bodies:
         return False
-    # The links' forces would pass through an effect in the drive; only a gear's friction knows them.
-    through = [e for e in plant.effects if (e.in_drive or e.needs_drive) and e.controller_field is None]
-    if not all(e.knows_links() for e in through):
-        return False
     if any(_joint_of(f, machine) is None or f.log is not None for f in machine.parameters.free):
         return False
     several = [part.log.reference is not None and part.log.reference.shape[1] > 1 for part in parts]
@@ -101,19 +112,20 @@ def stands_apart(machine: Machine, parts: Sequence[Part]) -> bool:
     return all(all(part.log.measured) and not part.log.integrated for part in parts) and all(several + usual)
 
 
-def joints_alone(machine: Machine, parts: Sequence[Part]) -> list[JointAlone]:
+def joints_alone(machine: Machine, parts: Sequence[Part], others: Sequence[Part] = ()) -> list[JointAlone]:
     """Return every joint of an arm that has unknowns, with its load along each log.
 
     Args:
         machine: Machine of all logs, which `stands_apart`.
         parts: The logs.
+        others: Logs that are not fitted.
     """
     loads, inertias = [], []
-    for part in parts:
+    for part in (*parts, *others):
         force, own = _of_links(_links(part.machine), *(getattr(part.data, n) for n in ("q", "qd", "qdd")))
         loads.append(np.asarray(force))
         inertias.append(np.asarray(own))
-    means = np.mean(np.concatenate(inertias), axis=0)
+    means = np.mean(np.concatenate(inertias[: len(parts)]), axis=0)
     names = machine.parameters.names
     out = []
     for joint in range(machine.plant.joints):
@@ -123,17 +135,23 @@ def joints_alone(machine: Machine, parts: Sequence[Part]) -> list[JointAlone]:
         if not own:
             continue
         alone = []
-        for part, load in zip(parts, loads, strict=True):
+        for part, load in zip((*parts, *others), loads, strict=True):
             # The force of the links beyond that of the constant inertia of the axis.
             beside = means[joint] * part.data.qdd[:, joint] - load[:, joint]
-            one = _machine(part.machine, joint, means[joint], beside, part.log.period)
+            one = _machine(part.machine, joint, means[joint], beside)
             index = np.array([own.index(name) for name in one.parameters.names], dtype=int)
             alone.append(Part(part.name, _log(part, joint), one, index, _prepared(part.data, joint)))
-        whole = _machine(machine, joint, means[joint], alone[0].machine.load, alone[0].log.period)
+        whole = _machine(machine, joint, means[joint], _column(alone[0].machine))
         index = np.array([names.index(name) for name in own])
         ratio = float(_ratios(machine.plant)[joint])
-        out.append(JointAlone(joint, whole, tuple(alone), index, float(means[joint]), ratio))
+        fitted, beside = tuple(alone[: len(parts)]), tuple(alone[len(parts) :])
+        out.append(JointAlone(joint, whole, fitted, index, float(means[joint]), ratio, beside))
     return out
+
+
+def _moves(part: Part) -> bool:
+    """Check that the reference moves in a log."""
+    return part.log.reference is not None and bool(np.ptp(part.log.reference) > 0)
 
 
 def _joint_of(f: Free, machine: Machine) -> int | None:
@@ -170,7 +188,7 @@ def _of_links(plant: LinkTree, q: Array, qd: Array, qdd: Array) -> tuple[Array, 
     return jax.vmap(plant.inertial)(q, qd, qdd), jax.lax.map(own, q[::every])
 
 
-def _machine(machine: Machine, joint: int, links: float, load: Any, period: float) -> Machine:
+def _machine(machine: Machine, joint: int, links: float, load: Float[np.ndarray, " time"]) -> Machine:
     """Return the machine of a joint, with its unknowns, whose links have a constant inertia."""
     plant, law = machine.plant, machine.controller
     assert isinstance(plant, LinkTree), "checked by stands_apart"
@@ -179,38 +197,55 @@ def _machine(machine: Machine, joint: int, links: float, load: Any, period: floa
     ratio, rotors = _ratios(plant)[joint], plant.rotor_inertia
     rotor = 0.0 if rotors is None else ratio * float(np.asarray(rotors)[joint])
 
-    numbers = [k for k, e in enumerate(plant.effects) if e.port == joint]
-    effects: tuple[Effect, ...] = tuple(replace(plant.effects[k], port=0) for k in numbers)
-    if load is not None:
-        beside = np.ravel(load)
-        effects = tuple(e.without_links(beside, period, law.period) for e in effects)
+    effects: tuple[Effect, ...] = tuple(replace(e, port=0) for e in plant.effects if e.port == joint)
     scale = plant.smoothing.velocity_scale
     smoothing = replace(plant.smoothing, velocity_scale=scale if np.ndim(scale) == 0 else scale[joint])
-    free = [
-        _free(f, numbers, links, ratio) for f in machine.parameters.free if _joint_of(f, machine) == joint
-    ]
+    own = [f for f in machine.parameters.free if _joint_of(f, machine) == joint]
+    free = [_free(f, machine, joint, links, ratio) for f in own]
     return replace(
         machine,
-        plant=Axis(jnp.asarray(links + rotor), effects=effects, smoothing=smoothing),
+        plant=LoadedAxis(jnp.asarray(links + rotor), effects=effects, smoothing=smoothing),
         parameters=Parameters(tuple(free)),
         gain=np.asarray(machine.gain)[drive : drive + 1],
+        units=replace(machine.units, motion=plant.motion(joint) or machine.units.motion),
         controller=_law(law, drive, len(machine.gain)),
         sensor=_sensor(machine.sensor, joint, plant.joints),
-        load=None if load is None else np.reshape(load, (-1, 1)),
+        load=np.reshape(load, (-1, 1)),
     )
 
 
-def _free(f: Free, effects: list[int], links: float, ratio: float) -> Free:
+def _column(machine: Machine) -> Float[np.ndarray, " time"]:
+    """Return the load of a joint alone."""
+    assert machine.load is not None, "a joint alone has one"
+    return machine.load[:, 0]
+
+
+def own_place(
+    path: tuple[str | int, ...], index: Any, machine: Machine, joint: int
+) -> tuple[tuple[str | int, ...], Any] | None:
+    """Return the place of a value of an arm in the plant of one of its joints alone; None if it has none."""
+    if path[0] == "effects":
+        numbers = _effects_at(machine, joint)
+        return (("effects", numbers.index(path[1]), *path[2:]), index) if path[1] in numbers else None
+    return (("inertia",), None) if path == (_ROTOR,) and index == joint else None
+
+
+def _effects_at(machine: Machine, joint: int) -> list[int | str]:
+    """Return the numbers of the effects of an arm at a joint."""
+    return [k for k, e in enumerate(machine.plant.effects) if e.port == joint]
+
+
+def _free(f: Free, machine: Machine, joint: int, links: float, ratio: float) -> Free:
     """Return an unknown of an arm as one of its joint alone."""
-    if f.effect is not None:
-        return replace(f, path=("effects", effects.index(f.effect), *f.path[2:]))
     if f.path[0] == CONTROLLER:
         return replace(f, index=0)
+    place = own_place(f.path, f.index, machine, joint)
+    assert place is not None, "checked by stands_apart"
+    f = replace(f, path=place[0], index=place[1])
+    if f.effect is not None:
+        return f
     ends = (links + ratio * max(f.lower, 0.0), links + ratio * f.upper)
-    guess = links + ratio * f.guess
-    return replace(
-        f, path=("inertia",), index=None, sign="positive", guess=guess, lower=ends[0], upper=ends[1]
-    )
+    return replace(f, sign="positive", guess=links + ratio * f.guess, lower=ends[0], upper=ends[1])
 
 
 def _law(law: Controller, drive: int, drives: int) -> Controller:

@@ -48,25 +48,38 @@ def apart_steps(
     """
     every = joints_alone(machine, parts)
     moving = [alone for alone in every if alone.moves]
-    numerics = numerics or common_numerics(moving)
-    profile = options.pop("profile", ())
-    fits = []
-    for alone in moving:
-        own = [name for name in profile if name in alone.machine.parameters.names]
-        start = _start(alone, numerics)
-        fits.append(
-            output_error_steps(
-                alone.machine,
-                alone.parts,
-                start=start,
-                numerics=numerics,
-                profile=own,
-                tolerance=_TOLERANCE,
-                **options,
-            )
+    found = yield from joint_fits(moving, numerics=numerics, **options)
+    return of_arm(machine, parts, every, dict(zip([a.joint for a in moving], found, strict=True)))
+
+
+def joint_fits(
+    joints: Sequence[JointAlone],
+    *,
+    numerics: Numerics | None = None,
+    profile: Sequence[str] = (),
+    **options: Any,
+) -> Steps[list[Estimate]]:
+    """Fit joints of an arm, each alone and all at once.
+
+    Args:
+        joints: The joints; the reference of each moves.
+        numerics, options: See `apart_steps`.
+        profile: Names of unknowns of the arm whose profile is computed.
+    """
+    numerics = numerics or common_numerics(joints)
+    fits = [
+        output_error_steps(
+            alone.machine,
+            alone.parts,
+            start=_start(alone, numerics),
+            numerics=numerics,
+            profile=[name for name in profile if name in alone.machine.parameters.names],
+            tolerance=_TOLERANCE,
+            **options,
         )
-    found = yield from side_by_side(fits)
-    return _of_arm(machine, parts, every, dict(zip([a.joint for a in moving], found, strict=True)))
+        for alone in joints
+    ]
+    return (yield from side_by_side(fits))
 
 
 def common_numerics(joints: Sequence[JointAlone]) -> Numerics:
@@ -143,10 +156,17 @@ def _start(alone: JointAlone, numerics: Numerics) -> np.ndarray:
     return points[best if not costs[best] > _CLEARLY * costs[usual] else usual]
 
 
-def _of_arm(
+def of_arm(
     machine: Machine, parts: Sequence[Part], every: Sequence[JointAlone], found: dict[int, Estimate]
 ) -> Estimate:
-    """Return the estimates of the joints as one of the arm; a joint that was not fitted keeps its guesses."""
+    """Return the estimates of joints as one of the arm; a joint that was not fitted keeps its guesses.
+
+    Args:
+        machine: Machine of all logs.
+        parts: The logs.
+        every: All joints with unknowns.
+        found: Estimates by joint.
+    """
     theta, beside = machine.parameters.guess, np.full(len(machine.parameters.free), np.nan)
     rows = sum(part.log.samples for part in parts)
     residual = np.full((rows, machine.plant.joints), np.nan)
@@ -158,7 +178,7 @@ def _of_arm(
             still.append(name)
             continue
         theta[alone.index] = alone.of_arm(estimate.theta)
-        residual[:, alone.joint] = estimate.residual[:, 0]
+        residual[:, alone.joint] = _residual(parts, alone, estimate)
         if estimate.std_misspecified is not None:
             beside[alone.index] = estimate.std_misspecified * alone.slope
         notes += [f"{name}: {note}" for note in estimate.notes[1:]]
@@ -183,6 +203,13 @@ def _of_arm(
         details={"profiles": profiles} if profiles else {},
         std_misspecified=beside,
     )
+
+
+def _residual(parts: Sequence[Part], alone: JointAlone, estimate: Estimate) -> np.ndarray:
+    """Return the residual of a joint along all logs of its arm; NaN along logs that it does not have."""
+    names, ends = [part.name for part in alone.parts], np.cumsum([p.log.samples for p in alone.parts])
+    own = dict(zip(names, np.split(estimate.residual[:, 0], ends[:-1]), strict=True))
+    return np.concatenate([own.get(p.name, np.full(p.log.samples, np.nan)) for p in parts])
 
 
 def _precision(machine: Machine, every: Sequence[JointAlone], found: dict[int, Precision]) -> Precision:

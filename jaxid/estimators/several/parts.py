@@ -15,7 +15,7 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 
 if TYPE_CHECKING:
-    from jaxid.session import Session
+    from jaxid.session import OpenedLog, Session
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,19 @@ class Part:
 
 def parts_of(session: Session) -> list[Part]:
     """Return the fitted logs of a session."""
-    names = session.machine.parameters.names
-    parts = []
-    for run in session.fits:
-        machine = run.machine(session.machine)
-        index = np.array([names.index(name) for name in machine.parameters.names], dtype=int)
-        parts.append(Part(run.name, run.log, machine, index, run.data))
-    return parts
+    return [part_of(run, session.machine) for run in session.fits]
+
+
+def part_of(run: OpenedLog, machine: Machine) -> Part:
+    """Return an opened log with its machine.
+
+    Args:
+        run: The log.
+        machine: Machine of all logs.
+    """
+    own, names = run.machine(machine), machine.parameters.names
+    index = np.array([names.index(name) for name in own.parameters.names], dtype=int)
+    return Part(run.name, run.log, own, index, run.data)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from jaxid.case.case import UNNAMED
 from jaxid.estimators.minimal.report import minimal_rows
 from jaxid.model.units import joined
 from jaxid.results import as_json as results
+from jaxid.results.by_joint import joint_rows
 from jaxid.results.drive_chain import drive_chain
 from jaxid.results.friction_curve import friction_views
 from jaxid.results.poses import poses_of
@@ -72,6 +73,7 @@ def discovery_data(result: Discovery) -> ReportData:
         gap=content["gap"],
         unidentifiable=tuple(content["unidentifiable"]),
         effects=tuple(_described(content["effects"], result)),
+        joints=tuple(joint_rows(content)),
         where=content["where"],
         steps=tuple(search_step(r) for r in result.rounds),
         where_plot=where_plot(result),

@@ -263,6 +263,7 @@ class ReportData:
         unidentifiable: `{"combination": {name: weight}}`, one for each.
         ratios: Rows of a table of ratios of unknowns without a scale, its head first; empty without one.
         effects: The effects that were found, in the order in which they were added.
+        joints: Rows of a table of what was found at each joint of an arm, its head first; empty without one.
         where: The `where` object of the JSON result, or None.
         steps: The search, step by step.
         where_plot: The residual over the variable that `where` names, or None.
@@ -301,6 +302,7 @@ class ReportData:
     unidentifiable: tuple[Mapping, ...] = ()
     ratios: tuple[tuple[str, ...], ...] = ()
     effects: tuple[Mapping, ...] = ()
+    joints: tuple[Sequence[str], ...] = ()
     where: Mapping | None = None
     steps: tuple[SearchStep, ...] = ()
     where_plot: WherePlot | tuple | None = None

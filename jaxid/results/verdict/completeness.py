@@ -188,6 +188,7 @@ def position_residuals(
         fitted: Whether the machine was fitted to this log.
     """
     joints = np.flatnonzero(run.log.measured).tolist()
+    machine = run.machine(machine)
     floor = position_noise(machine, run.log)
     if gap is None:
         return [
