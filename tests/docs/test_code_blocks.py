@@ -35,7 +35,10 @@ LONG = {
     "docs/robots.md",
     "docs/short_logs.md",
     "docs/without_a_controller.md",
+    "docs/without_a_force.md",
 }
+# tests/estimators/test_jax_door.py runs its blocks, and checks what they compute.
+CHECKED_ELSEWHERE = "docs/jax.md"
 # A block that begins so is a part of a file of docs/examples, which other tests run.
 EXCERPT = re.compile(r"^# (\w+\.py)\n")
 
@@ -82,7 +85,9 @@ def with_long_ones_slow(pages: list) -> list:
     return [pytest.param(*p.values, id=p.id, marks=pytest.mark.slow) if p.id in LONG else p for p in pages]
 
 
-@pytest.mark.parametrize("page", with_long_ones_slow(having("python")))
+@pytest.mark.parametrize(
+    "page", [p for p in with_long_ones_slow(having("python")) if p.id != CHECKED_ELSEWHERE]
+)
 def test_python_blocks_run(page, tmp_path):
     for source in (Path(jaxid.__file__).parent / "demo").glob("*.*"):
         if source.suffix != ".py":

@@ -33,7 +33,7 @@ def module(name: str) -> ModuleType:
 def identified(tmp_path_factory) -> dict:
     """Results of both examples, each from its case's guesses on a log that the case simulates.
 
-    The cart-pole is fitted by the quick method here; by the chosen one in a slow test.
+    They are fitted by the quick method here; by the chosen one in slow tests.
     """
     folder, found = tmp_path_factory.mktemp("guide"), {}
     for path in EXAMPLES.glob("*.*"):
@@ -41,8 +41,8 @@ def identified(tmp_path_factory) -> dict:
     for name in NAMES:
         log = jaxid.simulate(folder / f"{name}.toml", seed=1)
         log.save(folder / f"{name}.csv")
-        method = "inverse_dynamics" if name == "cart_pole" else None
-        found[name] = jaxid.identify(folder / f"{name}.toml", folder / f"{name}.csv", method=method)
+        files = folder / f"{name}.toml", folder / f"{name}.csv"
+        found[name] = jaxid.identify(*files, method="inverse_dynamics")
     return found
 
 
@@ -92,11 +92,16 @@ def test_the_pendulum_against_the_equations_of_its_circuit():
 
 
 @pytest.mark.parametrize(
-    "name", [n if n != "cart_pole" else pytest.param(n, marks=pytest.mark.slow) for n in NAMES]
+    ("name", "chosen"),
+    [
+        ("dc_motor_pendulum", False),
+        # The Coulomb friction of the cart-pole by inverse dynamics is several standard deviations off.
+        *(pytest.param(name, True, marks=pytest.mark.slow) for name in NAMES),
+    ],
 )
-def test_the_values_are_those_simulated_within_their_precision(identified, name):
+def test_the_values_are_those_simulated_within_their_precision(identified, name, chosen):
     found = identified[name]
-    if name == "cart_pole":
+    if chosen:
         path = Path(found.session.case.path)
         found = jaxid.identify(path, path.with_suffix(".csv"))
     assert found.converged
