@@ -159,7 +159,9 @@ def test_friction_of_one_gear_is_named_alone_at_its_joint(tmp_path):
     assert (first["effects"], second["effects"]) == (["load_friction"], [])
     assert first["simulation"]["after"] < 0.2 * first["simulation"]["before"]
     assert content["steps"][1] | {"added": "load_friction", "joint": 1} == content["steps"][1]
-    assert "Joint by joint" in (tmp_path / "out" / "report.html").read_text()
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "Joint by joint" in report
+    assert "found: load_friction (joint 1)" in report
     assert "load_friction" in (tmp_path / "out" / "case.toml").read_text()
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.in_loop.model_fit import ModelFit
+from jaxid.discovery.in_loop.model_fit import STEPS, ModelFit
 
 # Least points in simulation at each start of a candidate, and first steps of the fits that begin there.
 _LEAST, _FIRST = 16, 6
@@ -32,18 +32,20 @@ class Effort:
         begun: Points from which fits begin.
         ended: Fits of them that go on to the end.
         ahead: Candidates of which so many fits go on; of the others one does.
+        steps: Most steps with which they go on.
     """
 
     points: int = 512
     begun: int = 32
     ended: int = 8
     ahead: int = 5
+    steps: int = STEPS
 
 
 # MANY: about guesses of a user, which may be several times off. FEW: about values of a fit that began at
 # those of a balance, which is linear in the unknowns.
 MANY = Effort()
-FEW = Effort(points=64, begun=8, ended=2, ahead=3)
+FEW = Effort(points=64, begun=8, ended=1, ahead=1, steps=12)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from jaxid.simulation.replay import Replay
 # Starts of a compiled call with derivatives, and points of one without them.
 _STARTS, _POINTS = 8, 64
 # Largest number of steps of a fit, and the relative decrease of the squares at which it has converged.
-_STEPS, _SAME = 40, 1e-7
+STEPS, _SAME = 40, 1e-7
 # Damping of the first step, factors on it after a step that helps and after one that does not, its range.
 _DAMPING, _LESS, _MORE, _LEAST, _LARGEST = 1e-3, 0.2, 5.0, 1e-12, 1e8
 # Largest change of the logarithm of an unknown in a step.
@@ -102,7 +102,7 @@ class ModelFit:
         return np.concatenate(residuals, axis=1), np.concatenate(jacobians, axis=1)
 
     def fit(
-        self, thetas: Float[np.ndarray, "starts p"], moving: np.ndarray, *, steps: int = _STEPS
+        self, thetas: Float[np.ndarray, "starts p"], moving: np.ndarray, *, steps: int = STEPS
     ) -> tuple[Float[np.ndarray, "starts p"], Float[np.ndarray, " starts"]]:
         """Fit some unknowns by least squares from each of several starts.
 

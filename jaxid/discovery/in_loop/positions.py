@@ -20,7 +20,7 @@ from jaxid.discovery.acceptance import Acceptance
 from jaxid.discovery.domain import Domain
 from jaxid.discovery.final import machine_with
 from jaxid.discovery.in_loop.afar import Afar
-from jaxid.discovery.in_loop.model_fit import ModelFit, SimulatedLog
+from jaxid.discovery.in_loop.model_fit import STEPS, ModelFit, SimulatedLog
 from jaxid.discovery.score import Score
 from jaxid.discovery.screen import SURROGATES, Screen
 from jaxid.discovery.search import Model, Search
@@ -351,7 +351,9 @@ class LoopSearch(Search):
         """Fit the active unknowns to the log, from and beside the others, and from earlier fits of them."""
         return self.fit_from([theta], active)
 
-    def fit_from(self, starts: Sequence[np.ndarray] | np.ndarray, active: np.ndarray) -> np.ndarray:
+    def fit_from(
+        self, starts: Sequence[np.ndarray] | np.ndarray, active: np.ndarray, steps: int = STEPS
+    ) -> np.ndarray:
         """Fit the active unknowns from each of several starts and earlier fits, and return the best fit."""
         assert self.positions is not None, "given by the search"
         if not len(active):
@@ -359,7 +361,9 @@ class LoopSearch(Search):
         key = frozenset(active.tolist())
         earlier = [self._fits[key]] if key in self._fits else []
         acting = self.positions.acting(starts[0], active)
-        ends, squares = self.positions.model(self.samples, acting).fit(np.array([*starts, *earlier]), active)
+        ends, squares = self.positions.model(self.samples, acting).fit(
+            np.array([*starts, *earlier]), active, steps=steps
+        )
         best = ends[int(np.argmin(squares))]
         self._fits[key] = best
         return best
@@ -403,8 +407,9 @@ class LoopSearch(Search):
 
     def _scored(self, model: Model, c: cand.Candidate, starts: np.ndarray, screened: Screen) -> Score:
         """Fit a model with a candidate from some starts, and score what the best fit gains."""
+        assert self.afar is not None, "asked only of a search that has it"
         active = self.fitted_by((*model.added, c))
-        theta = self.fit_from(starts, active)
+        theta = self.fit_from(starts, active, self.afar.effort.steps)
         e, jacobian = self.domain.evaluate(self.samples, theta, active)
         gained = -np.inf
         if np.all(np.isfinite(e)) and np.all(np.isfinite(jacobian)):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxid.results.effect_words import words_of
 from jaxid.results.report.data import LogView, ReportData
 from jaxid.results.report.numbers import ABSENT, is_number, nats, usual_unit, with_std
-from jaxid.results.report.words import parameter_lines, place_words
+from jaxid.results.report.words import parameter_lines, place_words, shows_places
 
 # Rows of values that the first page shows whole, and those that it shows of more; all of them stand below.
 MOST_VALUES, FIRST_VALUES = 14, 8
@@ -25,8 +25,6 @@ _MODEL = {
 def found_entries(data: ReportData) -> list[dict]:
     """Return each effect that was found as words: name, place, formula, values, machines, rivals."""
     entries = []
-    # On a machine with one joint the place is not needed.
-    places = {place_words(effect) for effect in data.effects}
     for effect in data.effects:
         place = place_words(effect)
         words = words_of(effect["kind"], effect.get("doc", ""))
@@ -38,7 +36,7 @@ def found_entries(data: ReportData) -> list[dict]:
             {
                 "kind": effect["kind"],
                 "name": words.name[:1].upper() + words.name[1:],
-                "place": place if places - {"", "joint 1"} else "",
+                "place": place if shows_places(data) else "",
                 "formula": words.formula,
                 "numbers": values_words(effect.get("parameters") or {}),
                 "met": words.met,

@@ -52,7 +52,7 @@ class GapRow:
 def verdict_words(data: ReportData) -> str:
     """Return the verdict in plain words, such as "found: coulomb_friction"."""
     if data.verdict == "found":
-        found = "found: " + ", then ".join(_named(e, data.effects) for e in data.effects)
+        found = "found: " + ", then ".join(_named(e, shown=shows_places(data)) for e in data.effects)
         return found if data.explains else f"{found}; the log is not explained"
     if data.verdict is not None:
         return {"nothing_missing": "nothing is missing"}.get(data.verdict, data.verdict)
@@ -278,11 +278,14 @@ def step_words(number: int, step: SearchStep) -> str:
     return "declared model, refitted" if number == 0 else "nothing added"
 
 
-def _named(effect: Mapping, effects: Sequence[Mapping]) -> str:
-    # On a machine with one joint the place is not needed.
-    places = {place_words(e) for e in effects}
+def shows_places(data: ReportData) -> bool:
+    """Check that the places of effects are needed: a machine with one joint has one place."""
+    return bool(data.joints or {place_words(e) for e in data.effects} - {"", "joint 1"})
+
+
+def _named(effect: Mapping, *, shown: bool) -> str:
     place = place_words(effect)
-    return f"{effect['kind']} ({place})" if places - {"", "joint 1"} and place else effect["kind"]
+    return f"{effect['kind']} ({place})" if shown and place else effect["kind"]
 
 
 def _variable_unit(data: ReportData, variable: str | None) -> str:
