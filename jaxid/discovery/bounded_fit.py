@@ -12,6 +12,13 @@ from jaxtyping import Float
 from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.model.unknowns import Parameters
 
+# Largest logarithm of an unknown at the start and at the end: one that makes no difference any more grows
+# without end, and has no derivative at infinity.
+_FARTHEST = 300.0
+# Part of the largest column up to which one counts as zero. The solver scales each column to one: the trust
+# region of an unknown without effect would be all that there is.
+_NOTHING = 1e-30
+
 Rows = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -31,6 +38,8 @@ def bounded_fit(
     """
     transform = Transform.of(unknowns)
     lower, upper = (np.asarray(transform.inward(b)) for b in unknowns.bounds)
+    farthest = np.where(transform.log, _FARTHEST, np.inf)
+    begin = np.clip(np.asarray(transform.inward(jnp.asarray(start))), -farthest, farthest)
     latest: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     # The solver asks for residual and Jacobian at the same point one after the other.
@@ -42,12 +51,12 @@ def bounded_fit(
             e, columns = rows(values)
             slope = np.asarray(transform.slope(jnp.asarray(values)))
             with np.errstate(invalid="ignore", over="ignore"):  # diverged values are made finite below
-                latest[key] = (_finite(e), _finite(columns * slope))
+                latest[key] = (_finite(e), _counted(_finite(columns * slope)))
         return latest[key]
 
     fit = scipy.optimize.least_squares(
         lambda x: both(x)[0],
-        np.clip(np.asarray(transform.inward(jnp.asarray(start))), lower, upper),
+        np.clip(begin, lower, upper),
         lambda x: both(x)[1],  # pyright: ignore[reportArgumentType] (SciPy's stubs know names of methods only)
         (lower, upper),
         x_scale="jac",
@@ -56,9 +65,16 @@ def bounded_fit(
         gtol=1e-10,
         max_nfev=most,
     )
-    return np.asarray(transform.outward(jnp.asarray(fit.x))), bool(fit.status > 0)
+    end = np.clip(fit.x, -farthest, farthest)
+    return np.asarray(transform.outward(jnp.asarray(end))), bool(fit.status > 0)
 
 
 def _finite(x: np.ndarray) -> np.ndarray:
     """Replace diverged values by numbers so large that a solver turns back, yet small enough to square."""
     return np.clip(np.nan_to_num(x, nan=1e60), -1e60, 1e60)
+
+
+def _counted(columns: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, "rows k"]:
+    """Set columns to zero that are nothing beside the largest."""
+    size = np.linalg.norm(columns, axis=0)
+    return np.where(size > _NOTHING * size.max(initial=0.0), columns, 0.0)
