@@ -70,8 +70,8 @@ class Acceptance:
         ]
         force = self.data.at_kept(self.data.force - np.mean(self.data.force, axis=0))
         rows = len(self.samples.moving) / len(force)
-        self._numerics = rows * float(np.sum((NUMERICS * force) ** 2))
-        self._noise = float(np.sum(self.samples.moving.sum(axis=0) * np.square(self.floor)))
+        self._numerics = rows * np.sum((NUMERICS * force) ** 2, axis=0)
+        self._noise = self.samples.moving.sum(axis=0) * np.square(self.floor)
 
     @property
     def _independent(self) -> float:
@@ -81,7 +81,7 @@ class Acceptance:
     @property
     def noise(self) -> float:
         """Sum of squares of the noise."""
-        return self._noise
+        return float(self._noise.sum())
 
     def residual(self, theta: np.ndarray) -> Float[np.ndarray, "kept n"]:
         """Return the force residual of a model on the fitted log."""
@@ -108,16 +108,29 @@ class Acceptance:
 
     def above_numerics(self, theta: np.ndarray) -> bool:
         """Check that a residual exceeds the errors of filtering and integration."""
-        return self._sum(self.residual(theta)) - self._noise > self._numerics
+        return self._sum(self.residual(theta)) - self.noise > self._numerics.sum()
 
     def closed(self, old: Float[np.ndarray, "kept n"], new: Float[np.ndarray, "kept n"]) -> float:
-        """Return the part of the gap above the noise floor that closes, in sum of squares."""
-        before, after = self._sum(old), self._sum(new)
-        if before - after < self._numerics:
+        """Return the part of the gap above the noise floor that closes, in sum of squares over all joints."""
+        sums = (self._sums(old), self._sums(new), self._noise, self._numerics)
+        return self._part(*(float(x.sum()) for x in sums))
+
+    def closed_somewhere(self, old: Float[np.ndarray, "kept n"], new: Float[np.ndarray, "kept n"]) -> float:
+        """Return the largest part of the gap that closes, of all joints together or of a single one.
+
+        The friction of a wrist is little beside what the model still lacks at the shoulder.
+        """
+        sums = (self._sums(old), self._sums(new), self._noise, self._numerics)
+        by_joint = (self._part(*map(float, joint)) for joint in zip(*sums, strict=True))
+        return max(self.closed(old, new), *by_joint)
+
+    def _part(self, before: float, after: float, noise: float, numerics: float) -> float:
+        """Return the part of the gap that closes between two sums of squares."""
+        if before - after < numerics:
             return 0.0
         # The floor is itself an estimate, and a search always finds something to close: at least a part of
         # the residual counts as gap.
-        return float((before - after) / max(before - self._noise, self.least_gap * before))
+        return (before - after) / max(before - noise, self.least_gap * before, 1e-300)
 
     def absorbed_noise(self, samples: Samples, old: np.ndarray, new: np.ndarray) -> float:
         """Return the part of the noise that a new model's drive filters out; see `absorbed_noise`."""
@@ -188,10 +201,10 @@ class Acceptance:
                 return f"{free[i].name} runs to its limit, at which the effect only imitates another"
 
         e = self.residual(new)
-        if self._sum(e) < self._least(fitted) * self._noise:
+        if self._sum(e) < self._least(fitted) * self.noise:
             return "it removes more than the sensors' noise allows"
 
-        closed = self.closed(self.residual(old), e)
+        closed = self.closed_somewhere(self.residual(old), e)
         if closed < RELEVANT:
             part = 50 * closed  # in RMS: half of the part in squares, if that is small
             return f"it closes only {part:.1f} % of the gap" if part > 0.05 else "it closes none of the gap"
@@ -216,7 +229,10 @@ class Acceptance:
         return min(_LEAST, float(rarely))
 
     def _sum(self, e: np.ndarray) -> float:
-        return float(np.sum(np.where(self.samples.moving, e, 0.0) ** 2))
+        return float(self._sums(e).sum())
+
+    def _sums(self, e: np.ndarray) -> Float[np.ndarray, " n"]:
+        return np.sum(np.where(self.samples.moving, e, 0.0) ** 2, axis=0)
 
 
 def absorbed_noise(

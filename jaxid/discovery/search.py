@@ -373,7 +373,7 @@ class Search:
         if more > 0 or self._equal(current, best):
             return more < 0
         old, new = self.acceptance.residual(model.theta), self.acceptance.residual(best.refitted)
-        return self.acceptance.closed(old, new) > RELEVANT
+        return self.acceptance.closed_somewhere(old, new) > RELEVANT
 
     def _chance_difference(self, one: Score, two: Score) -> float:
         """Return the difference in evidence of two fits that chance may cause: two deviations [nats]."""
@@ -452,10 +452,11 @@ class Search:
     def _costs(self, model: Model, smaller: Model, limit: float) -> bool:
         """Check that a smaller model is worse than a model by more than noise and by a relevant part."""
         lost, part = self.loss(model, smaller)
-        return lost > limit and part > SUPERFLUOUS
+        # An effect stays where a loss is no finite number.
+        return not (lost <= limit or part <= SUPERFLUOUS)
 
     def loss(self, model: Model, smaller: Model) -> tuple[float, float]:
-        """Return what a smaller model loses: evidence [nats], and the part of its gap that a model closes."""
+        """Return what a smaller model loses: evidence [nats], and the part of a gap that the model closes."""
         active, remaining = self.fitted_by(model.added), self.fitted_by(smaller.added)
         e, jacobian = self.domain.evaluate(self.samples, model.theta, active)
         whitener = ev.Whitener.of(e, self.samples.moving, self.colour)
@@ -464,7 +465,7 @@ class Search:
         less, jacobian = self.domain.evaluate(self.samples, smaller.theta, remaining)
         after = now.held_out(less, jacobian[..., remaining])
         lost = float(ev.log_evidence(now.rows, after, now.before)[0])
-        return lost, self.acceptance.closed(less, e)
+        return lost, self.acceptance.closed_somewhere(less, e)
 
 
 def _starts(score: Score) -> list[np.ndarray]:

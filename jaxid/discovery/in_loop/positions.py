@@ -305,10 +305,10 @@ class LoopAcceptance(Acceptance):
         self.domain: Domain = self.positions
         self.samples, *self.others = self.logs
         self._numerics = sum(
-            float(np.sum(part.moving * np.square(NUMERICS * _scaled(part, np.std(part.measured, axis=0)))))
+            np.sum(part.moving * np.square(NUMERICS * _scaled(part, np.std(part.measured, axis=0))), axis=0)
             for part in self.samples.parts
         )
-        self._noise = float(np.sum(self.samples.moving.sum(axis=0) * np.square(self.floor)))
+        self._noise = self.samples.moving.sum(axis=0) * np.square(self.floor)
 
     @property
     def _independent(self) -> float:
