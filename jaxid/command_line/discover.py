@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
         "--max-effects",
         metavar="N",
         type=int,
-        help="most effects to add; default: 5, or two a joint if that is more. Of an arm's servos without a "
+        help="most effects to add; default: 5, or three a joint if that is more. Of an arm's servos without a "
         "force: at each joint",
     )
     add_numerics(parser)

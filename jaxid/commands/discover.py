@@ -54,7 +54,7 @@ _ABOVE_FLOOR = 1.3
 # Beyond this factor something is missing, even if the residual stands out over no variable.
 _FAR_ABOVE = 3.0
 # Largest number of effects to add unless it is stated, and that by joint of an arm.
-_EFFECTS, _BY_JOINT = 5, 2
+_EFFECTS, _BY_JOINT = 5, 3
 # Number of effects that hinder the simulation and are replaced; further ones are only removed.
 _BARRED = 3
 # Reason why no break-away friction is searched.
@@ -84,7 +84,7 @@ def discover(
         log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
         validate: Logs that must confirm each effect, beside those of the case.
         max_effects: Largest number of effects to add, without a force at each joint of an arm. None: five, or
-            two a joint of an arm if that is more.
+            three a joint of an arm if that is more.
         refit: Whether the parameters are refitted in simulation; if not, they are those of inverse dynamics.
         experiments: Whether experiments are designed that separate rival effects. None: unless joints are
             coupled, as in an arm, whose simulation takes minutes to compile for it.

@@ -440,20 +440,23 @@ class Search:
     def drop_superfluous(
         self, model: Model, limit: float, effects: Sequence[cand.Candidate]
     ) -> tuple[Model, list[Step]]:
-        """Drop those of some effects whose loss is below the noise, or below what is relevant."""
-        steps = []
-        for c in effects:
-            smaller = self.without(model, c)
-            if not self._costs(model, smaller, limit):
-                model = smaller
-                steps.append(self.step(model, dropped=c, threshold=limit))
-        return model, steps
+        """Drop those of some effects whose loss is below the noise, or below what is relevant.
 
-    def _costs(self, model: Model, smaller: Model, limit: float) -> bool:
-        """Check that a smaller model is worse than a model by more than noise and by a relevant part."""
-        lost, part = self.loss(model, smaller)
-        # An effect stays where a loss is no finite number.
-        return not (lost <= limit or part <= SUPERFLUOUS)
+        The least needed goes first. One that a few samples hold makes the others look superfluous: the model
+        predicts a stretch badly without these samples, with the others or without them.
+        """
+        steps, left = [], list(effects)
+        while left:
+            smaller = [self.without(model, c) for c in left]
+            losses = [self.loss(model, less) for less in smaller]
+            # An effect stays where its loss is no finite number.
+            free = [k for k, (lost, part) in enumerate(losses) if lost <= limit or part <= SUPERFLUOUS]
+            if not free:
+                break
+            least = min(free, key=lambda k: losses[k][0])
+            model, c = smaller[least], left.pop(least)
+            steps.append(self.step(model, dropped=c, threshold=limit))
+        return model, steps
 
     def loss(self, model: Model, smaller: Model) -> tuple[float, float]:
         """Return what a smaller model loses: evidence [nats], and the part of a gap that the model closes."""
