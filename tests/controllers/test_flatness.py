@@ -121,6 +121,7 @@ def test_flat_output_gives_all_inputs():
     np.testing.assert_allclose(np.asarray(run.velocity), motion[1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_live_identifies_switches_and_tracks(tmp_path):
     """Wrong values, truth of the exact simulator: all found in 0.1 s, then tracked far better."""
     case = tmp_path / "case.toml"

@@ -72,6 +72,7 @@ def test_smaller_is_the_same_signal_with_less_amplitude():
     np.testing.assert_allclose(half - half[0], 0.5 * (whole - whole[0]), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_gradient_through_the_simulation_is_that_of_differences(springs):
     (p, *rest), (_, slope) = CALLS[2]
     for k in range(0, p.size, 4):

@@ -171,6 +171,7 @@ def left(found) -> float:
     return float(np.sqrt(np.mean((tau + noise - told) ** 2)) / NOISE)
 
 
+@pytest.mark.slow
 def test_noise_makes_plain_least_squares_impossible_and_not_the_other(fits):
     plain, kept = fits[False], fits[True]
     # the moment about its own axis is told, and negative: no choice of the others makes a body of it

@@ -262,6 +262,7 @@ runs = 3
 """
 
 
+@pytest.mark.slow
 def test_a_study_takes_any(tmp_path):
     results = []
     for k, more in enumerate(("", '[output_error]\nminimiser = "optimistix.GaussNewton"\n')):

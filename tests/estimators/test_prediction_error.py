@@ -60,6 +60,7 @@ def fits(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_the_bound_at_the_truth_is_that_of_the_fit(fits):
     """A fit is near the truth, so that the information there is nearly its own, which may be widened."""
     for fit in fits[False]:

@@ -33,7 +33,9 @@ def logs() -> list[Log]:
     return [axis_log(seed) for seed in range(1, 5)]
 
 
-@pytest.mark.parametrize("method", [*METHODS, "algebraic", "power", *SLOW])
+@pytest.mark.parametrize(
+    "method", [*METHODS, pytest.param("algebraic", marks=pytest.mark.slow), "power", *SLOW]
+)
 def test_the_deviation_of_n_equal_logs_falls_as_one_over_the_root_of_n(method, logs):
     case = case_of(method)
     one, four = (jaxid.identify(case, logs[:n], method=method).estimate for n in (1, 4))

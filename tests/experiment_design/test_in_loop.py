@@ -105,6 +105,7 @@ def coarse(tmp_path_factory):
     return path, jaxid.design(path)
 
 
+@pytest.mark.slow
 def test_what_rounding_takes_is_expected_too(coarse):
     """Of an exact machine's logs sigma is as expected; and more is told than of the tour."""
     path, design = coarse

@@ -85,6 +85,7 @@ def test_the_motor_alone(log):
     assert constraint["p_value"] < 1e-6
 
 
+@pytest.mark.slow
 def test_the_load_turns_round_unseen(tmp_path):
     """Where it does its friction has another sign than the motor's: left in, 0.10 N at a sample."""
     made = flexible.flexible_log(duration=12.0, force_noise=0.0, resolution=0.0)
@@ -96,6 +97,7 @@ def test_the_load_turns_round_unseen(tmp_path):
     assert estimate.value("viscous_friction[2].coefficient") == pytest.approx(110, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_loads_acceleration(log):
     """Corrected it finds the inertias; as printed its third row lacks the load's friction."""
     estimate = fitted(log, "acceleration")
