@@ -36,8 +36,8 @@ def add(commands: Commands) -> None:
         "--max-effects",
         metavar="N",
         type=int,
-        help="most effects to add; default: 5, or three a joint if that is more. Of an arm's servos without a "
-        "force: at each joint",
+        help="most effects to add; default: 5, or three a joint if that is more. Of an arm's servos without "
+        "a force: at each joint",
     )
     add_numerics(parser)
     parser.add_argument(
