@@ -25,7 +25,7 @@ from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separating.propose import Proposal, proposals
 from jaxid.discovery.superset import build_candidate_model, scales_of
-from jaxid.discovery.together import add_together
+from jaxid.discovery.together import MANY, add_together
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_force, need_known_controller, need_known_reference
@@ -151,7 +151,9 @@ def explore(
     declared = begin(in_simulation, session, baseline, refit)
     if chosen:
         max_effects = max(max_effects, _BY_JOINT * session.fit.data.q.shape[1])
-    steps = search.run(max_effects)
+    steps = search.run(
+        max_effects, lambda search, first: add_together(search, first, max_effects, least=MANY)
+    )
     steps = add_together(search, steps, max_effects)
     if (other := _under_better_hold(session, search, baseline.machine)) is not None:
         declared.cancel()

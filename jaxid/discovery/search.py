@@ -157,16 +157,23 @@ class Search:
         gone = [*(self.model if model is None else model).added, *self.barred]
         return [c for c in self.superset.candidates if all(c is not g for g in gone)]
 
-    def run(self, most: int) -> list[Step]:
+    def run(
+        self, most: int, at_once: Callable[[Search, list[Step]], list[Step]] = lambda search, steps: steps
+    ) -> list[Step]:
         """Add effects until none is accepted, and drop those that become superfluous on the way.
 
         Args:
             most: Largest number of effects in the model.
+            at_once: Function of the search and its first step that may add several effects before, and then
+                continues the search; it returns all steps.
         """
         self.progress("fitting the baseline")
         self.model = self.renewed(Model((), self.fit(self.model.theta, self.active)))
         self.baseline = self.model.theta
         first = self.step(self.model)
+        steps = at_once(self, [first])
+        if len(steps) > 1:
+            return steps
         self.model, steps = self.grow(self.model, most)
         return [first, *steps]
 

@@ -13,9 +13,11 @@ from jaxid.discovery.search import SUPERFLUOUS, Model, Search, Step
 
 # Laws take the place of what was found one by one if they close this part of the gap that is left.
 _NEARLY_ALL = 0.9
+# Laws that are added before any single effect: fewer are found one by one, beside effects that resemble them.
+MANY = 6
 
 
-def add_together(search: Search, steps: list[Step], most: int) -> list[Step]:
+def add_together(search: Search, steps: list[Step], most: int, least: int = 1) -> list[Step]:
     """Add laws of all joints at once if single effects got stuck, and continue the search from there.
 
     A search adds one effect at a time, the one that gains most. Where several joints lack something, none
@@ -23,10 +25,14 @@ def add_together(search: Search, steps: list[Step], most: int) -> list[Step]:
     all joints are linear in their strengths, so that one fit holds all of them, and those that it does
     not need are dropped. They count only if they close nearly all that single effects left.
 
+    A robot's file often states no friction and no rotor at all. Before its first step a search tries that: at
+    least `MANY` laws that close nearly all of the gap.
+
     Args:
-        search: A search that has ended; its model changes if the laws are better.
+        search: A search that has ended, or has not begun; its model changes if the laws are better.
         steps: Its steps.
         most: Largest number of effects in the model.
+        least: Least number of laws that count.
 
     Returns:
         Steps of the search, with those that follow.
@@ -44,10 +50,12 @@ def add_together(search: Search, steps: list[Step], most: int) -> list[Step]:
         return steps
 
     laws = _needed(search, theta, laws)
+    if len(laws) < least:
+        return steps
     model = _fitted(search, laws)
     model, _ = search.drop_superfluous(model, search.limit, model.added)
     new = len(model.added)
-    if not 0 < new <= most or not _closes(search, old, model.theta) or _objection(search, old, model):
+    if not least <= new <= most or not _closes(search, old, model.theta) or _objection(search, old, model):
         return steps
     return _taken_over(search, steps, old, model, most)
 
@@ -125,8 +133,10 @@ def _taken_over(search: Search, steps: list[Step], old: Model, model: Model, mos
             now = _fitted(search, added)
             score = replace(score, theta=now.theta)
             steps.append(search.step(now, added=score, scores=(score,), threshold=search.limit))
-    search.model, more = search.grow(Model(tuple(added), model.theta), most)
-    return [*steps, *more]
+    model, more = search.grow(Model(tuple(added), model.theta), most)
+    # The evidence of noise is known by now.
+    search.model, dropped = search.drop_superfluous(model, search.limit, model.added)
+    return [*steps, *more, *dropped]
 
 
 def _score(search: Search, model: Model, c: cand.Candidate) -> Score:
