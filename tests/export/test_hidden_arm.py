@@ -92,3 +92,31 @@ def test_discover_names_all_that_the_file_lacks(files):
     assert {e.label for e in found.effects} == {name.split(".")[0] for name in expected}
     for name, true in expected.items():
         assert values[name] == pytest.approx(true, rel=0.01), name
+
+
+# A machine whose file states no friction at any joint, nor the rotor of the last.
+RUBBING = {
+    "yaw": {"frictionloss": 0.4, "damping": 0.3},
+    "shoulder": {"frictionloss": 0.9, "damping": 0.6},
+    "elbow": {"frictionloss": 0.3, "damping": 0.2, "armature": 0.05},
+}
+
+
+@pytest.mark.slow
+def test_what_every_joint_lacks_is_named_at_once(tmp_path):
+    """Seven laws: added one by one, the largest residual is of one joint and the evidence of another."""
+    (tmp_path / "robot.xml").write_text(user_file())
+    log = write_csv(tmp_path / "log.csv", arm_log(seconds=6.0, rate=200, hidden=RUBBING))
+    lines = []
+    tables = RobotCase.of(str(tmp_path / "robot.xml"), [str(log)], search=True).tables
+    found = jaxid.discover(tables, log, progress=lines.append)
+    expected = {"added_mass[3].mass": RUBBING["elbow"]["armature"]}
+    for k, values in enumerate(RUBBING.values(), start=1):
+        expected[f"coulomb_friction[{k}].level"] = values["frictionloss"]
+        expected[f"viscous_friction[{k}].coefficient"] = values["damping"]
+    assert {e.label for e in found.effects} == {name.split(".")[0] for name in expected}
+    for name, true in expected.items():
+        assert found.parameters[name].value == pytest.approx(true, rel=0.01), name
+    # They come before any single effect.
+    at = next(k for k, line in enumerate(lines) if "all joints at once" in line)
+    assert not any("screening" in line for line in lines[:at]), lines

@@ -39,19 +39,23 @@ def user_file() -> str:
     return ARM.format(yaw="", shoulder="", elbow="", mass=STATED)
 
 
-def true_file() -> str:
-    """The machine."""
-    shown = {joint: "".join(f' {n}="{v}"' for n, v in values.items()) for joint, values in HIDDEN.items()}
+def true_file(hidden: dict[str, dict[str, float]] = HIDDEN) -> str:
+    """The machine, with what its joints have."""
+    shown = {joint: "".join(f' {n}="{v}"' for n, v in values.items()) for joint, values in hidden.items()}
     return ARM.format(mass=MASS, **shown)
 
 
 def arm_log(
-    seconds: float = 12.0, rate: int = 250, noise: float = 1e-5, seed: int = 0
+    seconds: float = 12.0,
+    rate: int = 250,
+    noise: float = 1e-5,
+    seed: int = 0,
+    hidden: dict[str, dict[str, float]] = HIDDEN,
 ) -> dict[str, np.ndarray]:
     """Columns of a log by MuJoCo: the arm under PD control along sums of sines; torques are held."""
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string(true_file())
+    model = mujoco.MjModel.from_xml_string(true_file(hidden))
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     inner, count = round(1 / rate / model.opt.timestep), round(seconds * rate)
     frequency, phase = rng.uniform(0.2, 1.4, (5, 3)), rng.uniform(0, 2 * np.pi, (5, 3))
