@@ -126,7 +126,7 @@ def page(content: dict[str, Any]) -> str:
         "unknown. Errors are RMS of simulated minus measured position of the whole arm in mrad, a mean over",
         "the motions; a count of the encoder is 1.5. Evidence in nats; σ of noise alone.",
         "",
-        "| joint | found | evidence | not told from | left out before | after | fitted before | after | s |",
+        "| joint | found | evidence | rivals | left out before | after | fitted before | after | s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for k, joint in enumerate(content["joints"]):
