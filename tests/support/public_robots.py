@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 # Where the package example-robot-data keeps its files.
-_SHARE = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix" / "share" / "example-robot-data" / "robots"
+SHARE = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix" / "share" / "example-robot-data" / "robots"
 
 # Robots and their files; legged ones hang from their trunks.
 ROBOTS = {
@@ -28,7 +28,7 @@ ROBOTS = {
 
 def urdf_of(name: str) -> Path:
     """The robot's file; the test is skipped if the package is not installed."""
-    path = _SHARE / ROBOTS[name]
+    path = SHARE / ROBOTS[name]
     if not path.is_file():
         pytest.skip("example-robot-data is not installed: pip install 'jaxid[robots]'")
     return path
