@@ -139,7 +139,7 @@ def page(ran: dict[str, Ran], results: dict[str, dict]) -> str:
     for name, value in true.items():
         kind = name.split(".")[0]
         evidence = f"{nats[kind]:.0f} nats" if kind in nats else "not named"
-        cells = [f"{x[name][0]:.4g} ± {x[name][1]:.1g}" if name in x else "-" for x in values]
+        cells = [f"{x[name][0]:.4g} ± {x[name][1]:.2g}" if name in x else "-" for x in values]
         lines.append(f"| {kind} | {value:g} | {evidence} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
