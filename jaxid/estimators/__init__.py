@@ -345,6 +345,7 @@ CONSISTENT = (
     "instrumental_variable",
     "didim",
     "output_error",
+    "recursive",
 )
 
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {

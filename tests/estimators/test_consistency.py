@@ -213,6 +213,16 @@ def test_power_keeps_links_too(log, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_recursion_ends_at_real_bodies(log, tmp_path):
+    found = fitted(tmp_path, log, True, "recursive")
+    assert found.estimate.converged
+    assert eigenvalues(found).min() > 0
+    assert left(found) < 1.1
+    plain = fitted(tmp_path, log, False, "recursive")
+    assert eigenvalues(plain).min() < -0.001
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["instrumental_variable", "didim"])
 def test_methods_that_simulate_the_motion_keep_links_too(tmp_path, method):
     """From a loop of other physics; without, the noise of the torque asks for what no body can be."""
@@ -289,8 +299,8 @@ def test_a_prior_is_in_the_way_of_output_error_only(tmp_path):
         (
             "mass = { guess",
             "mass = { guess",
-            "recursive",
-            ["does not go with recursive", "inverse_dynamics, power"],
+            "prediction_error",
+            ["does not go with prediction_error", "inverse_dynamics, power"],
         ),
         (
             "[log]",

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.recursive.bodies import nearest_bodies
 from jaxid.estimators.recursive.precision import details_of, precision_of, weights_together
 from jaxid.estimators.recursive.recursion import (
     Recursion,
@@ -129,7 +130,8 @@ def recursive_steps(
         saved: Memory of an earlier run to continue, as `jaxid.estimators.recursive.memory` reads it.
 
     Returns:
-        The estimate at the end. Standard deviations include the residual's colour, the weights and the
+        The estimate at the end; links that must be physically consistent are the nearest real bodies, and
+        the history is without this. Standard deviations include the residual's colour, the weights and the
         remaining pull of the start. `details` has the history and the memory.
 
     Raises:
@@ -172,6 +174,7 @@ def recursive_steps(
             residuals = [each.residual(theta) for each in logs]
             notes += disagreement(residuals, int(precision.identifiable.sum()))
 
+    theta = yield from nearest_bodies(machine, np.asarray(course.memory.root), theta)
     converged = bool(np.all(np.isfinite(theta)))
     return Estimate(
         method="recursive",
