@@ -30,10 +30,11 @@ from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import need_force, need_known_controller, need_known_reference
 from jaxid.estimators.apart.joint import stands_apart
+from jaxid.estimators.common.consistency import need_bodies, with_links
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import inverse_dynamics
+from jaxid.estimators.inverse_dynamics import inverse_dynamics, inverse_dynamics_steps
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
 from jaxid.estimators.several.parts import parts_of
 from jaxid.gap import Gap, force_gap, gaps, noise_floor
@@ -148,7 +149,7 @@ def explore(
     progress("fitting the declared model")
     baseline, search = start_search(session, progress)
     # Compiling the refits takes as long as the search, and neither needs the other.
-    declared = begin(in_simulation, session, baseline, refit)
+    declared = begin(_as_bodies_in_simulation, session, baseline, refit)
     if chosen:
         max_effects = max(max_effects, _BY_JOINT * session.fit.data.q.shape[1])
     steps = search.run(
@@ -335,7 +336,23 @@ def start_search(
 
 def _with_effects(session: Session, final: Machine, refit: bool) -> tuple[Estimate, tuple[Gap, ...]]:
     """Fit the machine with the effects that were added, and return the fit and its gaps."""
-    return in_simulation(session, _of_force(session.with_machine(final)), refit)
+    return _as_bodies_in_simulation(session, _of_force(session.with_machine(final)), refit)
+
+
+def _as_bodies_in_simulation(
+    session: Session, start: Estimate, refit: bool
+) -> tuple[Estimate, tuple[Gap, ...]]:
+    """Run `in_simulation`, links being those of real bodies if the case asks for that.
+
+    The search goes without: what an effect explains hardly depends on it.
+    """
+    if session.case.identification.physically_consistent and not session.more:
+        # The bodies start at the guesses of the case, the effects at what was found.
+        known = session.machine.parameters.guess
+        at = start.machine.with_estimate([*known, *start.theta[len(known) :]])
+        bodies = need_bodies(session.with_machine(at))
+        start = run_alone(with_links(inverse_dynamics_steps(bodies.machine, session.fit.data)))
+    return in_simulation(session, start, refit)
 
 
 def _of_force(session: Session) -> Estimate:

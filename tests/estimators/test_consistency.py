@@ -1,6 +1,7 @@
 """Links that bodies can be: the coordinates, a fit that noise would make impossible, and what it refuses."""
 
 import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -220,6 +221,29 @@ def test_a_recursion_ends_at_real_bodies(log, tmp_path):
     assert left(found) < 1.1
     plain = fitted(tmp_path, log, False, "recursive")
     assert eigenvalues(plain).min() < -0.001
+
+
+@pytest.mark.slow
+def test_a_search_ends_at_real_bodies(log, tmp_path):
+    """A friction of the second joint is hidden; links that fit best without the demand are of no body."""
+    rubbing = np.array([0.0, 5.0, 0.0]) * motion(0)[2]
+    rubbed = replace(log, force=log.force + rubbing)
+    found = {}
+    for consistent in (False, True):
+        (tmp_path / "case.toml").write_text(case(consistent))
+        found[consistent] = jaxid.discover(tmp_path / "case.toml", rubbed)
+        assert [e.label for e in found[consistent].effects] == ["viscous_friction[2]"]
+        p = found[consistent].parameters["viscous_friction[2].coefficient"]
+        assert abs(p.value - 5.0) < 4 * p.std < 2.0
+    plants = {k: f.after.machine.plant for k, f in found.items()}
+    least = {
+        k: np.linalg.eigvalsh(
+            arm_oracle.pseudo_inertias(np.stack([getattr(p, name) for name in arm_oracle.NAMES], axis=-1))
+        ).min()
+        for k, p in plants.items()
+    }
+    assert least[False] < -0.001
+    assert least[True] > 0
 
 
 @pytest.mark.slow
