@@ -81,6 +81,7 @@ print(held.to_dataframe("held").held.unstack().to_string())
 # %% [markdown]
 # `inverse_dynamics` is within the range that sixty runs of a sound method have, 86.7 to 100 %, at its
 # lower end. For the inertia `std` is smaller than `spread`, so more runs may say that its intervals are a
-# little too narrow. `algebraic` integrates over short windows and is biased here,
-# and its intervals do not hold. This is the use of a study: to know before the fit which method to
+# little too narrow. `algebraic` integrates over short windows, whose friction at halts is not known. Its
+# intervals allow for that and hold the truth at 95 %, but the study says that they are not right at every
+# level: they are wider than the scatter. This is the use of a study: to know before the fit which method to
 # trust on such a log.

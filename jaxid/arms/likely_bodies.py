@@ -125,7 +125,10 @@ def _nearest(
         rest = wanted - mapping @ x
         if np.abs(rest).max(initial=0.0) < _ENOUGH * 1e-4:
             break
-        spread = np.linalg.solve(_divergence(x)[2], mapping.T)
+        try:
+            spread = np.linalg.solve(_divergence(x)[2], mapping.T)
+        except np.linalg.LinAlgError:
+            break
         step = spread @ np.linalg.lstsq(mapping @ spread, rest, rcond=1e-12)[0]
         if not np.all(np.linalg.eigvalsh(_matrices(x + step)) > 0):
             break
@@ -146,7 +149,11 @@ def _minimum(x: np.ndarray, mapping: np.ndarray, wanted: np.ndarray, weight: flo
     for _ in range(_STEPS):
         _, slope, curve = _divergence(x)
         slope = weight * slope + mapping.T @ (mapping @ x - wanted)
-        step = -np.linalg.solve(weight * curve + mapping.T @ mapping, slope)
+        try:
+            step = -np.linalg.solve(weight * curve + mapping.T @ mapping, slope)
+        except np.linalg.LinAlgError:
+            # Singular by rounding, under a small weight: the values are then near enough.
+            break
         fall = -float(slope @ step)
         if fall < 1e-12 * (abs(now) + weight):
             break

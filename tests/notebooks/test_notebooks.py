@@ -89,7 +89,8 @@ assert np.allclose([by_urdf.value(n) / result.value(n) for n in friction_names],
     "monte_carlo": """
 shares = held.sel(estimator="inverse_dynamics").values
 assert shares.min() >= 0.867, shares
-assert held.sel(estimator="algebraic").values.min() < 0.8
+assert held.sel(estimator="algebraic").values.min() >= 0.867
+assert "not at every level" in str(study)
 assert table.sizes["run"] == 60
 """,
     "paper_chain": """
@@ -132,7 +133,9 @@ def test_the_notebook_runs(script, tmp_path, monkeypatch):
     client = NotebookClient(notebook, timeout=600, kernel_name="python3")
     client.execute(cwd=str(FOLDER), env=dict(os.environ))
     outputs = [o for c in notebook.cells for o in c.get("outputs", [])]
-    assert not [o for o in outputs if o.get("name") == "stderr"]
+    warned = [o["text"] for o in outputs if o.get("name") == "stderr"]
+    # What another process writes just now is read in part; the code is then compiled again.
+    assert not [text for text in warned if "persistent compilation cache entry" not in text]
     assert [o for o in outputs if "image/png" in o.get("data", {})]
 
 

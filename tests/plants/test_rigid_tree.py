@@ -170,7 +170,8 @@ def test_a_batch_of_steps_is_each_step_alone():
     for sizes in (count, 1):
         together = jax.jit(jax.vmap(step))(q[:sizes], qd[:sizes], u[:sizes])
         for a, b in zip(together, alone, strict=True):
-            # The compiler orders sums of a batch otherwise: a few last digits of the largest entry.
-            np.testing.assert_allclose(a, b[:sizes], rtol=0, atol=1e-14 * np.max(np.abs(b)))
+            # Sums of a batch come in another order, and solving with the mass matrix enlarges what that
+            # rounds by its condition, 100 to 600.
+            np.testing.assert_allclose(a, b[:sizes], rtol=0, atol=1e-12 * np.max(np.abs(b)))
     stuck = (alone[1] == 0).any(axis=1)
     assert 0 < stuck.sum() < count
