@@ -170,7 +170,8 @@ def _step(
         gradient = jacobian[k].T @ e[k]
         free = ~((x[k] <= lower) & (gradient > 0) | (x[k] >= upper) & (gradient < 0))
         columns = jacobian[k][:, free]
-        size = np.linalg.norm(columns, axis=0)
+        with np.errstate(over="ignore"):  # a column that diverged takes no step
+            size = np.linalg.norm(columns, axis=0)
         size = np.where(size > 0, size, 1.0)
         scaled = columns / size
         matrix = scaled.T @ scaled + damping[k] * np.eye(len(size))
