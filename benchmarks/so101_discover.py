@@ -100,7 +100,8 @@ def record_of(result: Discovery, seconds: dict[int, float], session: Session) ->
         "verdict": content["verdict"],
         "joints": content["joints"],
         "effects": content["effects"],
-        "notes": content["notes"],
+        # What `check` says of single columns names files of this machine.
+        "notes": [note for note in content["notes"] if ".csv" not in note],
         "parameters": content["parameters"],
         "seconds": {str(joint + 1): round(s, 1) for joint, s in seconds.items()},
         "fitted": {"before": errors(result.gaps_before), "after": errors(result.gaps_after)},
