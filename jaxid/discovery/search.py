@@ -456,8 +456,12 @@ class Search:
         while left:
             smaller = [self.without(model, c) for c in left]
             losses = [self.loss(model, less) for less in smaller]
-            # An effect stays where its loss is no finite number.
-            free = [k for k, (lost, part) in enumerate(losses) if lost <= limit or part <= SUPERFLUOUS]
+            # An effect stays where its loss is not a number.
+            free = [
+                k
+                for k, (lost, part) in enumerate(losses)
+                if not np.isnan(lost) and (lost <= limit or part <= SUPERFLUOUS)
+            ]
             if not free:
                 break
             least = min(free, key=lambda k: losses[k][0])
