@@ -30,12 +30,14 @@ from benchmarks.stored_runs import commit_of
 from jaxid.commands.export import export
 from jaxid.commands.robot_case import RobotCase
 from jaxid.results.as_json import discovery_json, identification_json
-from tests.support.hidden_arm import JOINTS, MASS, arm_log, true_file, user_file
+from tests.support.hidden_arm import JOINTS, MASS, arm_log, inertial_forces, stated, true_file, user_file
 from tests.support.written_logs import write_csv
 
 ROOT = Path(__file__).parents[1]
 HERE = Path(__file__).parent / "results"
 SECONDS, RATE = 6.0, 200
+# Random states in which torques are compared.
+STATES = 200
 # Rows of a stretch. An arm that stands upright falls away from its log in an open loop.
 STRETCH = 50
 # Ranges of sysid's lists and where the fit starts: attributes of joints, in SI units.
@@ -236,34 +238,6 @@ def followed(file: str, columns: Mapping[str, np.ndarray]) -> float:
     return float(np.sqrt(np.mean(np.square(off))))
 
 
-def stated(file: str) -> dict[str, float]:
-    """Return what a file states of the joints, by joint and attribute."""
-    model, out = mujoco.MjModel.from_xml_string(file), {}
-    for name in JOINTS:
-        joint = model.joint(name)
-        dof = joint.dofadr[0]
-        out |= {
-            f"{name} armature": model.dof_armature[dof],
-            f"{name} damping": np.ravel(model.dof_damping[dof])[0],
-            f"{name} frictionloss": model.dof_frictionloss[dof],
-            f"{name} stiffness": np.ravel(model.jnt_stiffness[joint.id])[0],
-            f"{name} springref": model.qpos_spring[joint.qposadr[0]],
-        }
-    return out
-
-
-def inertial_forces(file: str) -> np.ndarray:
-    """Return the torques that move the bodies and rotors of a file on random states, (states, 3) [N m]."""
-    model = mujoco.MjModel.from_xml_string(file)
-    data, full, out = mujoco.MjData(model), np.zeros((model.nv, model.nv)), []
-    drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 3, len(JOINTS)))
-    for data.qpos[:], data.qvel[:], acceleration in drawn * np.array([1.0, 3.0, 10.0])[:, None]:
-        mujoco.mj_forward(model, data)
-        mujoco.mj_fullM(model, data, full)
-        out.append(full @ acceleration + data.qfrc_bias)
-    return np.array(out)
-
-
 def page(outcomes: list[Outcome]) -> str:
     """Return the page of the results."""
     true = stated(true_file())
@@ -288,8 +262,8 @@ def page(outcomes: list[Outcome]) -> str:
             cells.append(f"{file[name]:.4g}" + ("" if half is None else f" ± {half:.2g}"))
         lines.append(row(name, [f"{true[name]:g}", *cells]))
 
-    exact = inertial_forces(true_file())
-    apart = lambda file: np.max(np.abs(inertial_forces(file) - exact) / np.abs(exact).max(axis=0))
+    exact = inertial_forces(true_file(), STATES)
+    apart = lambda file: np.max(np.abs(inertial_forces(file, STATES) - exact) / np.abs(exact).max(axis=0))
     left_out = arm_log(seed=1, seconds=SECONDS, rate=RATE)
     shown_rms = lambda file: f"{1e3 * followed(file, left_out):.3g} mrad"
     every = [o.file for o in outcomes]

@@ -1,5 +1,6 @@
 """An arm in MuJoCo of which the user's file lacks or misstates five things, and its log with torques."""
 
+import mujoco
 import numpy as np
 
 # Yaw, shoulder and elbow; the last two turn about parallel axes.
@@ -53,8 +54,6 @@ def arm_log(
     hidden: dict[str, dict[str, float]] = HIDDEN,
 ) -> dict[str, np.ndarray]:
     """Columns of a log by MuJoCo: the arm under PD control along sums of sines; torques are held."""
-    import mujoco
-
     model = mujoco.MjModel.from_xml_string(true_file(hidden))
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     inner, count = round(1 / rate / model.opt.timestep), round(seconds * rate)
@@ -76,3 +75,31 @@ def arm_log(
     for k, name in enumerate(JOINTS):
         columns |= {f"q_{name}": q[:, k], f"torque_{name}": u[:, k]}
     return columns
+
+
+def stated(file: str) -> dict[str, float]:
+    """What a file states of the joints, by joint and attribute."""
+    model, out = mujoco.MjModel.from_xml_string(file), {}
+    for name in JOINTS:
+        joint = model.joint(name)
+        dof = joint.dofadr[0]
+        out |= {
+            f"{name} armature": model.dof_armature[dof],
+            f"{name} damping": np.ravel(model.dof_damping[dof])[0],
+            f"{name} frictionloss": model.dof_frictionloss[dof],
+            f"{name} stiffness": np.ravel(model.jnt_stiffness[joint.id])[0],
+            f"{name} springref": model.qpos_spring[joint.qposadr[0]],
+        }
+    return out
+
+
+def inertial_forces(file: str, count: int = 50) -> np.ndarray:
+    """Forces that move the bodies and rotors of a file in some random states, by MuJoCo: (count, 3) [N m]."""
+    model = mujoco.MjModel.from_xml_string(file)
+    data, full, out = mujoco.MjData(model), np.zeros((model.nv, model.nv)), []
+    drawn = np.random.default_rng(0).uniform(-1, 1, (count, 3, len(JOINTS)))
+    for data.qpos[:], data.qvel[:], acceleration in drawn * np.array([1.0, 3.0, 10.0])[:, None]:
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, full)
+        out.append(full @ acceleration + data.qfrc_bias)
+    return np.array(out)
