@@ -25,10 +25,15 @@ from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separating.propose import Proposal, proposals
 from jaxid.discovery.superset import build_candidate_model, scales_of
-from jaxid.discovery.together import MANY, add_together
+from jaxid.discovery.together import LEAST_AT_ONCE, add_together
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
-from jaxid.estimators import need_force, need_known_controller, need_known_reference
+from jaxid.estimators import (
+    need_force,
+    need_known_controller,
+    need_known_reference,
+    one_log_for_bodies,
+)
 from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.common.consistency import need_bodies, with_links
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
@@ -126,9 +131,11 @@ def explore(
         max_effects, refit, experiments, progress: Settings of `discover`.
 
     Raises:
-        InputError: If the reference has unknowns.
+        InputError: If the reference has unknowns, or several logs are to keep links physically consistent.
     """
     need_known_reference(session, "an error of it would be taken for an effect")
+    if session.more and session.case.identification.physically_consistent:
+        raise one_log_for_bodies(session.case.where)
     asked, chosen = max_effects, max_effects is None
     max_effects = _EFFECTS if max_effects is None else max_effects
     if session.machine.unforced(session.fit.log):
@@ -153,7 +160,7 @@ def explore(
     if chosen:
         max_effects = max(max_effects, _BY_JOINT * session.fit.data.q.shape[1])
     steps = search.run(
-        max_effects, lambda search, first: add_together(search, first, max_effects, least=MANY)
+        max_effects, lambda search, first: add_together(search, first, max_effects, least=LEAST_AT_ONCE)
     )
     steps = add_together(search, steps, max_effects)
     if (other := _under_better_hold(session, search, baseline.machine)) is not None:
@@ -346,7 +353,7 @@ def _as_bodies_in_simulation(
 
     The search goes without: what an effect explains hardly depends on it.
     """
-    if session.case.identification.physically_consistent and not session.more:
+    if session.case.identification.physically_consistent:
         # The bodies start at the guesses of the case, the effects at what was found.
         known = session.machine.parameters.guess
         at = start.machine.with_estimate([*known, *start.theta[len(known) :]])

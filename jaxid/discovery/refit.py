@@ -48,7 +48,7 @@ def refit_of(session: Session, start: Estimate) -> Estimate:
         return start if blind else _refit_together(session, start)
     method = "" if blind else choose_method(session).method
     if method == "prediction_error" and start.machine.parameters.bodies:
-        note = "not refitted by prediction_error, which keeps no bodies"
+        note = "not refitted: prediction_error does not keep links physically consistent"
         return replace(start, notes=(*start.notes, note))
     if method == "prediction_error":
         return _refit_innovations(session, start)

@@ -14,7 +14,7 @@ from jaxid.discovery.search import SUPERFLUOUS, Model, Search, Step
 # Laws take the place of what was found one by one if they close this part of the gap that is left.
 _NEARLY_ALL = 0.9
 # Laws that are added before any single effect: fewer are found one by one, beside effects that resemble them.
-MANY = 6
+LEAST_AT_ONCE = 6
 
 
 def add_together(search: Search, steps: list[Step], most: int, least: int = 1) -> list[Step]:
@@ -26,7 +26,7 @@ def add_together(search: Search, steps: list[Step], most: int, least: int = 1) -
     not need are dropped. They count only if they close nearly all that single effects left.
 
     A robot's file often states no friction and no rotor at all. Before its first step a search tries that: at
-    least `MANY` laws that close nearly all of the gap.
+    least `LEAST_AT_ONCE` laws that close nearly all of the gap.
 
     Args:
         search: A search that has ended, or has not begun; its model changes if the laws are better.

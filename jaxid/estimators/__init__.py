@@ -470,8 +470,17 @@ def need_one_log(session: Session, method: str) -> None:
         what = f"{method} fits one log, and there are {len(session.fits)}"
         raise InputError(what, where=where, hint=f"take one of {several}, or name one log")
     if session.case.identification.physically_consistent:
-        what = "physically_consistent goes with one log"
-        raise InputError(what, where=f"{where}, [identification]", hint="leave it out, or name one log")
+        raise one_log_for_bodies(where)
+
+
+def one_log_for_bodies(where: str) -> InputError:
+    """Return the error that links can be kept physically consistent with one log only.
+
+    Args:
+        where: Where the case is.
+    """
+    what = "physically_consistent goes with one log"
+    return InputError(what, where=f"{where}, [identification]", hint="leave it out, or name one log")
 
 
 def need_no_profile(session: Session, asked: Sequence[str]) -> None:

@@ -19,7 +19,7 @@ _NONE_NAMED = {
     "at_rest": "its command does not move",
 }
 _MEASURES = ("before", "after", "noise_floor")
-_HEAD = ("joint", "found", "evidence [nats]", "not told from")
+_HEAD = ("joint", "found", "evidence [nats]", "rivals")
 
 
 def joints_json(result: Discovery, motion: Mapping[str, Any]) -> list[dict[str, Any]]:

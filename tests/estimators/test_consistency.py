@@ -223,6 +223,19 @@ def test_a_recursion_ends_at_real_bodies(log, tmp_path):
     assert eigenvalues(plain).min() < -0.001
 
 
+def test_several_logs_with_real_bodies_are_refused_by_a_search_too(log, tmp_path, capsys):
+    rows = np.column_stack([log.time, log.position, log.force])
+    for name in ("one", "two"):
+        columns = "t,q1,q2,q3,u1,u2,u3"
+        np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header=columns, comments="")
+    fits = "".join(f'[[fit]]\nname = "{name}"\nlog = "{name}.csv"\n' for name in ("one", "two"))
+    (tmp_path / "case.toml").write_text(case(True) + fits)
+    assert main(["discover", str(tmp_path / "case.toml"), "-o", str(tmp_path / "out")]) == 2
+    [error] = capsys.readouterr().err.strip().splitlines()
+    assert "physically_consistent goes with one log" in error
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_a_search_ends_at_real_bodies(log, tmp_path):
     """A friction of the second joint is hidden; links that fit best without the demand are of no body."""

@@ -53,8 +53,8 @@ def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[
     arm = ArmSearch.of(session)
     found: dict[int, Discovery] = {}
     for number, joint in enumerate(arm.declared, start=1):
-        tell = _prefixed(progress, f"{joint_words(session, joint)} ({number} of {len(arm.declared)})")
-        found[joint] = arm.searched(joint, max_effects=max_effects, progress=tell)
+        at_joint = _prefixed(progress, f"{joint_words(session, joint)} ({number} of {len(arm.declared)})")
+        found[joint] = arm.searched(joint, max_effects=max_effects, progress=at_joint)
     progress("simulating the whole arm")
     return arm.together(found)
 

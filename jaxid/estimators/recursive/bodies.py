@@ -1,4 +1,4 @@
-"""Links of real bodies at the end of a recursion, whose samples are only weighed by their noise."""
+"""Real bodies nearest to the last estimate of a recursion, which goes sample by sample without them."""
 
 from __future__ import annotations
 
