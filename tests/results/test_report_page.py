@@ -87,6 +87,20 @@ def test_what_was_found_stands_in_the_chain_and_in_words(found):
     assert page.index("What was found") < page.index("The drive chain") < page.index("This run")
 
 
+def test_effects_of_one_kind_at_many_joints_are_one_entry(found):
+    data = discovery_data(found)
+    [one] = data.effects
+    joints = [3, 1, 2, 4, 5]
+    page = words(render(replace(data, effects=tuple({**one, "joint": k} for k in joints))))
+    assert "found: coulomb_friction at 5 places" in page
+    assert page.count("Dry friction (") == 1
+    at = [page.index(f"joint {k}: level = ") for k in range(1, 6)]
+    assert at == sorted(at)
+    # A few stand one by one, in the order in which they were found.
+    few = words(render(replace(data, effects=tuple({**one, "joint": k} for k in joints[:2]))))
+    assert "found: coulomb_friction (joint 3), then coulomb_friction (joint 1)" in few
+
+
 def test_a_long_list_of_values_begins_with_what_is_known(fitted):
     data = identification_data(fitted)
     rows = [replace(data.parameters[0], name=f"mass[{k}]", identifiable=k > 20) for k in range(40)]

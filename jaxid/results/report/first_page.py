@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxid.results.effect_words import words_of
 from jaxid.results.report.data import LogView, ReportData
-from jaxid.results.report.numbers import ABSENT, is_number, nats, usual_unit, with_std
+from jaxid.results.report.numbers import ABSENT, is_number, usual_unit, with_std
 from jaxid.results.report.words import parameter_lines, place_words, shows_places
 
 # Rows of values that the first page shows whole, and those that it shows of more; all of them stand below.
@@ -23,28 +23,36 @@ _MODEL = {
 
 
 def found_entries(data: ReportData) -> list[dict]:
-    """Return each effect that was found as words: name, place, formula, values, machines, rivals."""
-    entries = []
-    for effect in data.effects:
-        place = place_words(effect)
+    """Return each kind of effect that was found as words: name, formula, machines, and where it acts.
+
+    Under `at` stands for each place: its name, the values there, and the rivals.
+    """
+    entries: dict[str, dict] = {}
+    for effect in sorted(data.effects, key=lambda e: e.get("joint") or 0):
         words = words_of(effect["kind"], effect.get("doc", ""))
         others = [
             f"{a.get('kind', '')} {place_words(a)}".strip().replace("_", " ")
             for a in effect.get("alternatives") or ()
         ]
-        entries.append(
+        entry = entries.setdefault(
+            effect["kind"],
             {
                 "kind": effect["kind"],
                 "name": words.name[:1].upper() + words.name[1:],
-                "place": place if shows_places(data) else "",
                 "formula": words.formula,
-                "numbers": values_words(effect.get("parameters") or {}),
                 "met": words.met,
-                "evidence": nats(effect.get("evidence")),
+                "at": [],
+            },
+        )
+        entry["at"].append(
+            {
+                "place": place_words(effect) if shows_places(data) else "",
+                "numbers": values_words(effect.get("parameters") or {}),
                 "others": others,
             }
         )
-    return entries
+    # Kinds stand in the order in which they were found.
+    return [entries[kind] for kind in dict.fromkeys(effect["kind"] for effect in data.effects)]
 
 
 def values_words(parameters: Mapping[str, Mapping]) -> str:

@@ -24,6 +24,8 @@ from jaxid.results.report.numbers import (
 )
 
 _MOST_INTERVALS = 6
+# Effects that a verdict names one by one.
+_MOST_NAMED = 4
 # Half the width of a 95 % interval, in standard deviations.
 _INTERVAL = 1.96
 # Ratio of a gap to the measured signal beyond which its number says nothing.
@@ -52,7 +54,7 @@ class GapRow:
 def verdict_words(data: ReportData) -> str:
     """Return the verdict in plain words, such as "found: coulomb_friction"."""
     if data.verdict == "found":
-        found = "found: " + ", then ".join(_named(e, shown=shows_places(data)) for e in data.effects)
+        found = f"found: {_named_effects(data)}"
         return found if data.explains else f"{found}; the log is not explained"
     if data.verdict is not None:
         return {"nothing_missing": "nothing is missing"}.get(data.verdict, data.verdict)
@@ -281,6 +283,19 @@ def step_words(number: int, step: SearchStep) -> str:
 def shows_places(data: ReportData) -> bool:
     """Check that the places of effects are needed: a machine with one joint has one place."""
     return bool(data.joints or {place_words(e) for e in data.effects} - {"", "joint 1"})
+
+
+def _named_effects(data: ReportData) -> str:
+    """Return the effects in the order in which they were found; of many, their kinds and numbers."""
+    if len(data.effects) <= _MOST_NAMED:
+        return ", then ".join(_named(e, shown=shows_places(data)) for e in data.effects)
+    by_kind: dict[str, list[Mapping]] = {}
+    for effect in data.effects:
+        by_kind.setdefault(effect["kind"], []).append(effect)
+    return ", ".join(
+        _named(alike[0], shown=shows_places(data)) if len(alike) == 1 else f"{kind} at {len(alike)} places"
+        for kind, alike in by_kind.items()
+    )
 
 
 def _named(effect: Mapping, *, shown: bool) -> str:
