@@ -26,10 +26,8 @@ def nearest_bodies(
         theta: The estimate, (p,).
 
     Returns:
-        The values, (p,); those of the estimate if no link has to be consistent.
+        The values, (p,).
     """
-    if not machine.parameters.bodies:
-        return theta
     # Unknowns that the log does not determine begin at the guess, and stay near it.
     columns = np.linalg.solve(root, np.eye(len(theta)))
     places = tuple(body.places for body in machine.parameters.bodies)

@@ -174,7 +174,9 @@ def recursive_steps(
             residuals = [each.residual(theta) for each in logs]
             notes += disagreement(residuals, int(precision.identifiable.sum()))
 
-    theta = yield from nearest_bodies(machine, np.asarray(course.memory.root), theta)
+    if machine.parameters.bodies:
+        theta = yield from nearest_bodies(machine, np.asarray(course.memory.root), theta)
+        notes.append("the links are those of the nearest real bodies at the end; the course over time is not")
     converged = bool(np.all(np.isfinite(theta)))
     return Estimate(
         method="recursive",
