@@ -1,5 +1,6 @@
-"""Ten public robots against Pinocchio and MuJoCo, from their URDF and from what MuJoCo makes of it."""
+"""Ten public robots against Pinocchio and MuJoCo: by URDF and what MuJoCo makes of it, or by MJCF."""
 
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,7 +13,16 @@ from jaxid.case.mjcf import robot_of_spec
 from jaxid.case.robot import Robot
 from jaxid.case.urdf import read_urdf_tree
 from jaxid.plants import LinkTree
-from tests.support.public_robots import ROBOTS, Dynamics, by_mujoco, by_pinocchio, states, urdf_of
+from tests.support.public_robots import (
+    MENAGERIE,
+    ROBOTS,
+    Dynamics,
+    by_mujoco,
+    by_pinocchio,
+    mjcf_of,
+    states,
+    urdf_of,
+)
 
 COUNT = 1000
 GRAVITY = (0.0, 0.0, -9.81)
@@ -33,6 +43,10 @@ def by_jaxid(robot: Robot, order: list[str]) -> Dynamics:
         leading=robot.leading,
         gravity_vector=jnp.asarray(GRAVITY),
     )
+    # A URDF states no rotors.
+    rotors = np.array([joint.armature for joint in robot.free])
+    if rotors.any():
+        plant = replace(plant, rotor_inertia=rotors)
     free = [joint.name for joint in robot.free]
     assert sorted(free) == sorted(order)
     ours, theirs = [order.index(name) for name in free], [free.index(name) for name in order]
@@ -96,3 +110,16 @@ def test_dynamics_are_those_of_mujoco_from_either_file(name, tmp_path):
     theirs = by_mujoco(path, model, COUNT)
     agree(by_jaxid(robot, theirs.names), theirs)
     agree(by_jaxid(read_urdf_tree(path), theirs.names), theirs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(MENAGERIE))
+def test_dynamics_of_an_mjcf_are_those_of_both(name, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    path = mjcf_of(name, tmp_path)
+    robot, model = robot_of_spec(mujoco.MjSpec.from_file(str(path)), str(path))
+    theirs = by_mujoco(path, model, COUNT)
+    ours = by_jaxid(robot, theirs.names)
+    assert len(theirs.names) >= 6
+    agree(ours, theirs)
+    agree(ours, by_pinocchio(path, COUNT))

@@ -11,19 +11,19 @@ import pytest
 # Where the package example-robot-data keeps its files.
 SHARE = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix" / "share" / "example-robot-data" / "robots"
 
-# Robots and their files; legged ones hang from their trunks.
+# Robots and their URDFs; legged ones hang from their trunks.
 ROBOTS = {
     "panda": "panda_description/urdf/panda.urdf",
-    "ur10": "ur_description/urdf/ur10_robot.urdf",
-    "xarm7": "xarm_description/urdf/xarm7.urdf",
-    "kinova": "kinova_description/robots/kinova.urdf",
     "tiago": "tiago_description/robots/tiago.urdf",
     "go2": "go2_description/urdf/go2.urdf",
     "anymal": "anymal_c_simple_description/urdf/anymal.urdf",
     "so101": "so_arm_description/urdf/so101.urdf",
     "talos arm": "talos_data/robots/talos_left_arm.urdf",
     "pr2": "pr2_description/urdf/pr2.urdf",
+    "tiago pro": "tiago_pro_description/robots/tiago_pro.urdf",
 }
+# Robots of which mujoco-menagerie has an MJCF, and no package a URDF: their names there, and the entries.
+MENAGERIE = {"ur10e": ("universal_robots_ur10e", "ur10e"), "iiwa": ("kuka_iiwa_14", "iiwa14")}
 
 
 def urdf_of(name: str) -> Path:
@@ -32,6 +32,25 @@ def urdf_of(name: str) -> Path:
     if not path.is_file():
         pytest.skip("example-robot-data is not installed: pip install 'jaxid[robots]'")
     return path
+
+
+def mjcf_of(name: str, folder: Path) -> Path:
+    """Write the robot's MJCF without its shapes, whose meshes neither its inertias nor its joints need.
+
+    The test is skipped if the file is not there: the package downloads it, or takes it from MENAGERIE_ROOT.
+    """
+    menagerie = pytest.importorskip("mujoco_menagerie")
+    robot, entry = MENAGERIE[name]
+    try:
+        tree = ElementTree.parse(menagerie.get(robot).xml(entry))
+    except menagerie.MenagerieError as error:
+        pytest.skip(f"mujoco-menagerie has no file of {robot} here: {error}")
+    for part in [tree.getroot(), *tree.getroot().iter("body")]:
+        for absent in (x for tag in ("geom", "asset", "contact", "keyframe") for x in part.findall(tag)):
+            part.remove(absent)
+    written = folder / f"{entry}.xml"
+    tree.write(written)
+    return written
 
 
 @dataclass
@@ -77,9 +96,10 @@ def states(count: int, joints: int) -> np.ndarray:
 
 
 def by_pinocchio(path: Path, count: int) -> Dynamics:
-    """The robot as Pinocchio reads it, projected on its free joints."""
+    """The robot as Pinocchio reads it from a URDF or an MJCF, projected on its free joints."""
     pinocchio = pytest.importorskip("pinocchio")
-    model = pinocchio.buildModelFromUrdf(str(path))
+    read = pinocchio.buildModelFromUrdf if path.suffix == ".urdf" else pinocchio.buildModelFromMJCF
+    model = read(str(path))
     data = model.createData()
     mimics = Mimics.of(path, list(model.names)[1:])
 
@@ -102,7 +122,7 @@ def by_pinocchio(path: Path, count: int) -> Dynamics:
 
 
 def by_mujoco(path: Path, model, count: int) -> Dynamics:
-    """The robot as MuJoCo compiled it from its URDF, projected on its free joints."""
+    """The robot as MuJoCo compiled it from its file, projected on its free joints."""
     import mujoco
 
     data = mujoco.MjData(model)
