@@ -29,8 +29,9 @@ from jaxid.logs.prepare import Prepared, Recipe
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
 from jaxid.model.unknowns import label
+from jaxid.numerics.directions import held, named_directions
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.precision import Precision, held, named_directions
+from jaxid.numerics.precision import Precision
 from jaxid.session import OpenedLog, Session
 from jaxid.simulation.force_balance import ForceData, force_and_columns, sharpened
 

@@ -18,7 +18,7 @@ from jaxid.arms.base_parameters import (
 )
 from jaxid.errors import InputError, suggest
 from jaxid.model.plant import Plant
-from jaxid.numerics.precision import held, named_directions
+from jaxid.numerics.directions import held, named_directions
 
 # Singular values below this part of the largest are rounding: configurations known to ten digits.
 _ROUNDING = 1e-9

@@ -24,7 +24,8 @@ from jaxid.logs.seen import Sight, sights_of
 from jaxid.model.unknowns import scatter
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import run_alone
-from jaxid.numerics.precision import Precision, Rows, assess_together
+from jaxid.numerics.precision import Precision
+from jaxid.numerics.rows import Rows, assess_together
 from jaxid.session import Logs, OpenedLog, Session, open_session
 from jaxid.simulation.force_balance import ForceData, force_residual, force_size, sharpened
 from jaxid.simulation.sensor_noise import force_noise, position_noise

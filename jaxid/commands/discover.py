@@ -48,8 +48,8 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
+from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.numerics.lanes import begin, run_alone
-from jaxid.numerics.precision import NoiseModel
 from jaxid.session import Logs, OpenedLog, Session, open_session
 from jaxid.session.holds import session_under_better_hold
 from jaxid.simulation.force_balance import ForceData

@@ -20,7 +20,7 @@ from jaxid.discovery.in_loop.positions import NUMERICS, LoopSamples, PositionDom
 from jaxid.errors import InputError
 from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.machine import Machine
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.session import OpenedLog
 from jaxid.simulation.sensor_noise import position_noise
 

@@ -17,7 +17,7 @@ from jaxid.discovery.domain import Domain, ForceDomain
 from jaxid.discovery.noise import NUMERICS, sensor_colour
 from jaxid.gap import noise_floor
 from jaxid.machine import Machine
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.own_values import OwnValues
 from jaxid.session import OpenedLog
 

@@ -15,7 +15,7 @@ from jaxid.discovery.domain import Domain, ForceDomain, Samples
 from jaxid.discovery.noise import NUMERICS
 from jaxid.discovery.selection import TIE_NATS
 from jaxid.logs.prepare import Prepared
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 
 # An effect must close this part of the gap above the noise floor (in sum of squares, so about half of this
 # part in RMS), whatever its evidence: on measured data every effect helps a little.

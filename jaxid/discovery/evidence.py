@@ -13,7 +13,7 @@ import scipy.fft
 import scipy.sparse
 from jaxtyping import Bool, Float, Int
 
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 
 BLOCKS = 10
 # Number of rows over which whitening may leave a correlation, and least number of stretches of a surrogate.

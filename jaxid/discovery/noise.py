@@ -12,7 +12,7 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.numerics import filters as signals
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 
 # Part of the force that filtering, holding and integrating leave wrong in any model: an effect with a smaller
 # RMS cannot be distinguished from these errors.

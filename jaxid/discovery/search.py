@@ -17,7 +17,7 @@ from jaxid.discovery.score import Score
 from jaxid.discovery.screen import Screen, guess_pair, screen_candidates
 from jaxid.discovery.selection import MODEST, margin, next_effect, shortlist, simplest_equivalent
 from jaxid.logs.prepare import Prepared
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 
 # An unknown of the case counts as displaced if an effect leaves less than this part of its value.
 _GONE = 1e-2

@@ -16,7 +16,7 @@ from jaxid.discovery import evidence as ev
 from jaxid.discovery.noise import fit_whitener
 from jaxid.logs.prepare import Prepared
 from jaxid.model.plant import Plant
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 
 # Knots of the curve, at quantiles of the variable.
 _KNOTS = 12

@@ -38,7 +38,8 @@ from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
-from jaxid.numerics.precision import Precision, Rows, assess_together
+from jaxid.numerics.precision import Precision
+from jaxid.numerics.rows import Rows, assess_together
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 from jaxid.simulation.replay import Numerics, Replay
 

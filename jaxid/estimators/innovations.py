@@ -17,9 +17,10 @@ from jaxid.estimators.common.scoring import Scored, maximise_likelihood, observe
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.full_hessian import profiled_out
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.precision import Precision, profiled_out
+from jaxid.numerics.precision import Precision
 from jaxid.simulation.kalman import KalmanFilter
 
 # Evaluations of a fit.

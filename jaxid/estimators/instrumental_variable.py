@@ -29,7 +29,7 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Parameters
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
-from jaxid.numerics.precision import Rows, assess_together
+from jaxid.numerics.rows import Rows, assess_together
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 from jaxid.simulation.replay import Numerics
 

@@ -15,7 +15,7 @@ from jaxid.estimators.several.descent import Descent, Model, descent_steps
 from jaxid.estimators.several.parts import Part
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import ParallelCalls, Steps
-from jaxid.numerics.precision import Rows
+from jaxid.numerics.rows import Rows
 
 # Rise of the log-likelihood [nats] below which a fit of several logs has converged, as of one log.
 _TOLERANCE, _DAMPING = 1e-5, 1e-3

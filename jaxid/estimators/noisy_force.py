@@ -20,7 +20,7 @@ from jaxid.estimators.simulated_output import output_residual
 from jaxid.model.plant import Plant
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.precision import Rows
+from jaxid.numerics.rows import Rows
 from jaxid.simulation.replay import Replay, noise_of_command
 
 # Pairs of simulated noise: a standard deviation from so many draws is itself within 9 %.

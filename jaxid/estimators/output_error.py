@@ -45,7 +45,8 @@ from jaxid.model.unknowns import REFERENCE, in_loop
 from jaxid.numerics import filters as signals
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
-from jaxid.numerics.precision import Precision, Rows, assess_together, hessian_notes
+from jaxid.numerics.precision import Precision, hessian_notes
+from jaxid.numerics.rows import Rows, assess_together
 from jaxid.simulation.noisy_loop import ReadingNoise
 from jaxid.simulation.replay import (
     Numerics,
@@ -84,7 +85,7 @@ def output_error(
         start: Start of the fit in place of the guesses, for example from `inverse_dynamics`, (p,).
         numerics: Settings of the integration; None: chosen from plant and log.
         hessian: Whether the covariance uses the full Hessian in place of Gauss-Newton's; see
-            `jaxid.numerics.precision.hessian_covariance`.
+            `jaxid.numerics.full_hessian.hessian_covariance`.
         profile: Names of the unknowns whose profile likelihood is computed; see
             `jaxid.estimators.common.profile`.
         on: One of `jaxid.names.OUTPUTS`. With "both" each column is divided by the standard deviation of its

@@ -24,9 +24,10 @@ from jaxid.estimators.simulated_output import (
 from jaxid.gap import SHORT
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
+from jaxid.numerics.full_hessian import full_hessian
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps, solved_together
-from jaxid.numerics.precision import Rows, full_hessian
+from jaxid.numerics.rows import Rows
 from jaxid.simulation.kalman import rounded_readings
 from jaxid.simulation.noisy_loop import ReadingNoise
 from jaxid.simulation.replay import (

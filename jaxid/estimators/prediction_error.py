@@ -34,7 +34,8 @@ from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
-from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, Rows, assess_together, hessian_notes
+from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, hessian_notes
+from jaxid.numerics.rows import Rows, assess_together
 from jaxid.simulation.replay import Numerics
 from jaxid.simulation.sensor_noise import force_noise
 
@@ -78,7 +79,7 @@ def prediction_error(
             it was logged exactly.
         alone: Whether `start` is the only start, because it is known to be near the optimum.
         hessian: Whether the covariance uses the observed information in place of Fisher's; see
-            `jaxid.numerics.precision.hessian_covariance`.
+            `jaxid.numerics.full_hessian.hessian_covariance`.
         profile: Names of the unknowns whose profile likelihood is computed; see
             `jaxid.estimators.common.profile`.
 

@@ -18,7 +18,8 @@ from jaxid.estimators.simulated_output import output_residual
 from jaxid.model.plant import Plant
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.precision import Precision, Rows
+from jaxid.numerics.precision import Precision
+from jaxid.numerics.rows import Rows
 from jaxid.simulation.replay import Replay
 
 # Pairs of simulated noise.

@@ -31,9 +31,10 @@ from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import typical_velocity
 from jaxid.model.unknowns import scatter
+from jaxid.numerics.coloured_noise import autoregressions, sandwiches
 from jaxid.numerics.filters import high_band_std_of_rows, spectral_rows
 from jaxid.numerics.lanes import accelerator, cores, side_by_side
-from jaxid.numerics.precision import assess_from_sums, autoregressions, deviations, sandwiches
+from jaxid.numerics.precision import assess_from_sums, deviations
 from jaxid.sensors.encoder import Sensor
 from jaxid.session import Session, enough
 from jaxid.simulation.disturbance import disturbance_at

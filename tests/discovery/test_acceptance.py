@@ -15,7 +15,7 @@ from jaxid.discovery.screen import has_influence
 from jaxid.discovery.search import Model
 from jaxid.discovery.where import _bin_offset
 from jaxid.gap import noise_density
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.session import open_session
 from jaxid.simulation.force_balance import ForceData, force_residual
 from tests.support.axis_log import log_of

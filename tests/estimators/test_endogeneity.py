@@ -10,8 +10,8 @@ from jaxid.estimators import _start, loop_noise
 from jaxid.estimators.common.endogeneity import endogeneity
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.loop_noise import with_loop_noise
+from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.numerics.lanes import run_alone
-from jaxid.numerics.precision import NoiseModel
 from jaxid.session import open_session
 from tests.estimators.test_simulated_motion import COULOMB, VISCOUS, WIDE
 from tests.support.axis_log import log_of

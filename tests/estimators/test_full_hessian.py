@@ -14,8 +14,9 @@ from jaxid.build import build_machine
 from jaxid.estimators.output_error import output_error, output_error_steps
 from jaxid.estimators.simulated_output import output_residual
 from jaxid.logs.log import Log
+from jaxid.numerics.full_hessian import full_hessian, hessian_covariance
 from jaxid.numerics.lanes import run_batched
-from jaxid.numerics.precision import assess, full_hessian, hessian_covariance, hessian_notes
+from jaxid.numerics.precision import assess, hessian_notes
 from jaxid.simulation.replay import Numerics, make_replay, with_fitted_start
 from tests.support.cli_setup import place, recorded, refused, run
 

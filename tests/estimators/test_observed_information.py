@@ -18,7 +18,7 @@ from jaxid.estimators.common.profile import OFFSETS
 from jaxid.estimators.innovations import Innovations, fit, whole_hessian
 from jaxid.estimators.prediction_error import prediction_error, prediction_error_steps
 from jaxid.logs.log import Log
-from jaxid.numerics.precision import profiled_out
+from jaxid.numerics.full_hessian import profiled_out
 from jaxid.session import open_session
 from jaxid.simulation.replay import Numerics
 from tests.estimators.test_prediction_error import opened

@@ -14,7 +14,8 @@ from jaxid.estimators.algebraic.windows import kernels_of, weak_residual
 from jaxid.estimators.common.halts import Friction, errors_at_halts
 from jaxid.estimators.common.windowed import row_covariance_steps, weights_of_rows
 from jaxid.numerics.lanes import run_alone
-from jaxid.numerics.precision import Rows, assess
+from jaxid.numerics.precision import assess
+from jaxid.numerics.rows import Rows
 from jaxid.session import open_session
 from jaxid.simulation.force_balance import ForceData, sharpened
 from tests.support.axis_log import log_of

@@ -12,15 +12,9 @@ from jaxid.dynamics.residuals import residual_along
 from jaxid.effects import EFFECTS
 from jaxid.model.smoothing import Smoothing
 from jaxid.model.unknowns import scatter
-from jaxid.numerics.precision import (
-    NoiseModel,
-    assess,
-    assess_from_sums,
-    autoregressions,
-    deviations,
-    full_hessian,
-    sandwich,
-)
+from jaxid.numerics.coloured_noise import NoiseModel, autoregressions, sandwich
+from jaxid.numerics.full_hessian import full_hessian
+from jaxid.numerics.precision import assess, assess_from_sums, deviations
 from jaxid.plants import Axis
 
 AR2 = np.array([1.4, -0.6])

@@ -11,7 +11,8 @@ import jaxid
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.gap import force_gap
-from jaxid.numerics.precision import NoiseModel, Precision
+from jaxid.numerics.coloured_noise import NoiseModel
+from jaxid.numerics.precision import Precision
 from jaxid.results.verdict import judge
 from jaxid.results.verdict.absurd import remarks_on
 from jaxid.results.verdict.completeness import cumulated_excess, residuals_of, systematic_rms

@@ -442,7 +442,8 @@ FAULTS = {
     "no simulation": ("duration = 2.0\n", "", "no duration"),
     "an estimator that keeps no bodies": (
         '[study]\nestimators = ["inverse_dynamics", "algebraic"]',
-        '[identification]\nphysically_consistent = true\n[study]\nestimators = ["algebraic", "prediction_error"]',
+        "[identification]\nphysically_consistent = true\n"
+        '[study]\nestimators = ["algebraic", "prediction_error"]',
         "does not go with prediction_error",
     ),
     "an estimator that is not there": ('"algebraic"', '"recursion"', "did you mean 'recursive'?"),

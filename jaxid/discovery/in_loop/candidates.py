@@ -24,9 +24,9 @@ from jaxid.estimators.within_prior.quantisation import quantisation_samples
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
 from jaxid.model.plant import Plant
+from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import run_alone
-from jaxid.numerics.precision import NoiseModel
 from jaxid.session import Session
 from jaxid.simulation.replay import Replay
 from jaxid.simulation.step_size import with_numerical_damping

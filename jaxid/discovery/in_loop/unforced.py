@@ -38,9 +38,9 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
 from jaxid.model.plant import Plant
+from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import run_alone
-from jaxid.numerics.precision import NoiseModel
 from jaxid.results.verdict.completeness import position_residuals
 from jaxid.session import OpenedLog, Session
 from jaxid.simulation.loops import Trajectory

@@ -18,7 +18,7 @@ from jaxid.discovery.separating.rivals import Experiment, ModelPair, Pair, loss
 from jaxid.experiment_design.improve import improved
 from jaxid.experiment_design.limits import LimitCost, Limits, Peaks, kept_within
 from jaxid.experiment_design.shapes import Shapes, basis
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.sensors.encoder import Sensor
 from jaxid.session import Session
 from jaxid.simulation.force_balance import ForceData

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Bool, Float
 
-from jaxid.numerics.precision import NoiseModel, sandwich
+from jaxid.numerics.coloured_noise import NoiseModel, sandwich
 
 # Singular values of the noise in the scaled regressor below this are rounding.
 _ROUNDING = 1e-9

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.numerics.precision import Rows
+from jaxid.numerics.rows import Rows
 
 # Eigenvalue of the scaled normal matrix, relative to the largest, below which a direction does not move.
 _BLIND = 1e-10

@@ -23,7 +23,8 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.precision import Precision, Rows, assess
+from jaxid.numerics.precision import Precision, assess
+from jaxid.numerics.rows import Rows
 from jaxid.simulation.force_balance import ForceData, sharpened
 from jaxid.simulation.sensor_noise import force_noise, linearised_balance, position_noise
 

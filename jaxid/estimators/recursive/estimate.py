@@ -39,7 +39,7 @@ from jaxid.machine import Machine
 from jaxid.model.effect import carries_force
 from jaxid.model.parameter import parameters_of
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.precision import Rows as Residual
+from jaxid.numerics.rows import Rows as Residual
 from jaxid.settings import Recursive
 
 # Largest number of instants in the history of a log.

@@ -12,8 +12,9 @@ from jaxtyping import Float, Int
 from jaxid.estimators.recursive.recursion import Recursion, RecursiveEstimate, RecursiveMemory
 from jaxid.estimators.recursive.rows import Rows
 from jaxid.machine import Machine
-from jaxid.numerics.precision import NoiseModel, Precision, assess_from_sums, sandwich
-from jaxid.numerics.precision import Rows as Residual
+from jaxid.numerics.coloured_noise import NoiseModel, sandwich
+from jaxid.numerics.precision import Precision, assess_from_sums
+from jaxid.numerics.rows import Rows as Residual
 from jaxid.settings import Recursive
 
 

@@ -23,7 +23,7 @@ from jaxid.estimators.several.weights import descended_steps, disagreement, star
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import SolveRequest, Steps
 from jaxid.numerics.misspecified import std_under_misspecification
-from jaxid.numerics.precision import Rows, assess_together
+from jaxid.numerics.rows import Rows, assess_together
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 
 # Part of the cost by which a fit has converged, and most evaluations, as of the fit to one log.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxid.estimators.several.descent import Model
-from jaxid.numerics.precision import Rows
+from jaxid.numerics.rows import Rows
 
 
 def summed(logs: list[Rows], slope: np.ndarray) -> Model:

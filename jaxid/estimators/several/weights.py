@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxid.estimators.several.descent import Descent
 from jaxid.numerics.lanes import Steps
-from jaxid.numerics.precision import Rows
+from jaxid.numerics.rows import Rows
 
 T = TypeVar("T")
 # Rounds of fit and weights, and the relative change of all weights at which they end.

@@ -60,16 +60,10 @@ from jaxid.estimators.within_prior.subspace import (
 )
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
+from jaxid.numerics.full_hessian import hessian_covariance
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.precision import (
-    FULL_HESSIAN,
-    LAPLACE,
-    POSTERIOR,
-    Precision,
-    Rows,
-    hessian_covariance,
-    hessian_notes,
-)
+from jaxid.numerics.precision import FULL_HESSIAN, LAPLACE, POSTERIOR, Precision, hessian_notes
+from jaxid.numerics.rows import Rows
 from jaxid.simulation.replay import Numerics
 
 # Number of random points from which the fit restarts if no direction is identifiable at the guesses.

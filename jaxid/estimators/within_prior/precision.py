@@ -19,8 +19,10 @@ from jaxid.estimators.within_prior.posterior import (
 from jaxid.estimators.within_prior.problem import Compared
 from jaxid.estimators.within_prior.subspace import SubspaceFit
 from jaxid.machine import Machine
+from jaxid.numerics.full_hessian import full_hessian
 from jaxid.numerics.lanes import Steps
-from jaxid.numerics.precision import GAUSS_NEWTON, LAPLACE, Precision, Rows, assess_together, full_hessian
+from jaxid.numerics.precision import GAUSS_NEWTON, LAPLACE, Precision
+from jaxid.numerics.rows import Rows, assess_together
 
 # An unknown is identifiable if its posterior standard deviation is below this, in those of its prior.
 _IDENTIFIABLE_STD = 0.5

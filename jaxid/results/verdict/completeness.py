@@ -19,7 +19,7 @@ from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.gap import ForceGap, SimulationGap, noise_density, row_noise
 from jaxid.logs.soundness import position_levels
 from jaxid.machine import Machine
-from jaxid.numerics.precision import NoiseModel
+from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.session import OpenedLog
 from jaxid.simulation.force_balance import ForceData, inertial_force
 from jaxid.simulation.noisy_loop import mean_readings
