@@ -13,6 +13,7 @@ from jaxid.commands.discover import discover
 from jaxid.commands.init import init
 from jaxid.commands.robot_case import RobotCase, let_go
 from jaxid.errors import InputError
+from jaxid.session import open_session
 from tests.export.test_replayed import SERVOS, TRUE, logged, text
 from tests.support.cli_setup import run
 from tests.support.urdf_arms import arm
@@ -59,6 +60,41 @@ def test_joints_that_the_log_lacks_are_held(folder):
     assert case.tables["plant"]["actuators"] is False
     assert case.actuator.gain == 1.0
     assert any("the others are held at zero" in line for line in first.assumed)
+
+
+PENDULUM_ON_CART = """
+<mujoco><worldbody><body><joint name="slide" type="slide" axis="1 0 0"/>
+<inertial pos="0 0 0" mass="1.2" diaginertia="0.01 0.01 0.01"/>
+<body><joint name="swing" axis="0 1 0"/>
+<inertial pos="0 0 -0.25" mass="0.3" diaginertia="0.007 0.007 0.0001"/></body></body></worldbody>
+<actuator><motor joint="slide"/></actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize("force", ["F [N]", "slide torque [N]"])
+def test_joints_without_an_actuator_need_no_force(tmp_path, force):
+    (tmp_path / "cart.xml").write_text(PENDULUM_ON_CART)
+    t = np.arange(400) / 100
+    columns = {"t": t, "x [m]": np.sin(2 * t), "theta [rad]": np.cos(3 * t), force: np.cos(7 * t)}
+    if force != "F [N]":
+        columns = {"t": t, "slide pos": np.sin(2 * t), "swing pos": np.cos(3 * t), force: np.cos(7 * t)}
+    log = write_csv(tmp_path / "log.csv", columns)
+    first = init(log, mjcf=tmp_path / "cart.xml", folder=tmp_path)
+    assert any("only slide of cart.xml has an actuator" in line for line in first.assumed)
+    case = first.case()
+    assert case.plant.names == ("slide", "swing")
+    assert case.tables["log"]["force"] == force.split(" [")[0]
+    assert open_session(case, log).fit.log.force.shape == (400, 1)
+
+
+def test_a_force_for_some_joints_only_is_named(tmp_path, capsys):
+    t = np.arange(400) / 100
+    columns = {"t": t, "x": np.sin(2 * t), "theta": np.cos(3 * t), "F": np.cos(7 * t)}
+    log = write_csv(tmp_path / "log.csv", columns)
+    assert main(["init", str(log), "-o", str(tmp_path / "case.toml")]) == 2
+    [line] = capsys.readouterr().err.strip().splitlines()
+    assert "2 joints move ('x', 'theta'), and not each has a force: 'F'" in line
+    assert "--mjcf" in line
 
 
 def test_a_urdf_is_a_tree_too(folder):

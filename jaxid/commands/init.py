@@ -138,7 +138,8 @@ def init(
     chosen = choose(columns_of(raw.data, raw.units, raw.contents.time, names), raw.source)
     arm = None if urdf is None or robot is not None else read_urdf(urdf, tip)
     if robot is not None:
-        chosen = of_tree(chosen, names, robot.file, raw.source)
+        actuated = {drive.joint for drive in robot.drives}
+        chosen = of_tree(chosen, names, actuated, robot.file, raw.source)
     elif arm is not None:
         chosen = of_arm(chosen, arm, str(urdf), raw.source)
     elif len(chosen.joints) > 1:

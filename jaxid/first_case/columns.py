@@ -57,6 +57,8 @@ class Chosen:
     Attributes:
         time: The time; None: there is none.
         position, velocity, force, reference: Columns by joint; empty: there are none.
+        driven: Places of the joints that the forces belong to; None: there is one for each joint.
+        loose_forces: Forces of a log of several joints that has not one for each of them.
         joints: Words that name the joints; an empty text for a single one.
         said: Lines on choices that names do not show.
         questions: Doubts, by quantity.
@@ -67,6 +69,8 @@ class Chosen:
     velocity: tuple[Column, ...] = ()
     force: tuple[Column, ...] = ()
     reference: tuple[Column, ...] = ()
+    driven: tuple[int, ...] | None = None
+    loose_forces: tuple[Column, ...] = ()
     joints: tuple[str, ...] = ("",)
     said: tuple[str, ...] = ()
     questions: Mapping[str, str] = field(default_factory=dict)
@@ -133,7 +137,7 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
     joints = tuple(position or velocity)
     used = [*position.values(), *velocity.values()]
     others = [c for c in rest if not any(c is u for u in used)]
-    force = _forces(others, joints, position, said, questions)
+    force, loose_forces = _forces(others, joints, position, said, questions)
     others = [c for c in others if not any(c is u for u in force.values())]
     reference = _references(others, position, spare, said, questions)
     velocity = _matched(velocity, joints)
@@ -144,6 +148,7 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
         velocity=tuple(velocity.values()),
         force=tuple(force.values()),
         reference=tuple(reference.values()),
+        loose_forces=loose_forces,
         joints=joints,
         said=tuple(said),
         questions=questions,
@@ -239,8 +244,11 @@ def _forces(
     position: Mapping[str, Column],
     said: list[str],
     questions: dict[str, str],
-) -> dict[str, Column]:
-    """Return the force of each joint: the surest witness of it that the log has; empty if there is none."""
+) -> tuple[dict[str, Column], tuple[Column, ...]]:
+    """Return the force of each joint, the surest witness of it that the log has; empty if one has none.
+
+    If one of several joints has none, the forces that there are follow.
+    """
     known = [c for c in others if c.meaning.quantity in FORCES or _bare_command(c, position)]
     ranked = sorted(known, key=_force_rank)
     usable = []
@@ -267,15 +275,15 @@ def _forces(
             column = max(silent, key=lambda c: _roughness(c.values))
             said.append(f"force is '{column.name}', because no name says force, torque, current or voltage")
             questions["force"] = f"is '{column.name}' the force, or the command of the drive?"
-            return {joints[0]: column}
+            return {joints[0]: column}, ()
         voltages = [c for c in others if c.meaning.quantity == "voltage" and c.moves]
-        return {joints[0]: voltages[0]} if voltages else {}
+        return ({joints[0]: voltages[0]} if voltages else {}), ()
 
     beside = [c for c in usable if not any(c is k for k in chosen.values())]
     if chosen and beside and len(joints) == 1:
         listed = ", ".join(f"'{c.name}'" for c in beside)
         said.append(f"force is '{next(iter(chosen.values())).name}'; {listed} could be it as well")
-    return chosen
+    return chosen, () if chosen else tuple(usable)
 
 
 def _force_rank(column: Column) -> tuple[int, bool]:

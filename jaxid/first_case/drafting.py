@@ -12,10 +12,9 @@ import numpy as np
 
 from jaxid.case.robot import Robot
 from jaxid.case.urdf import Urdf
-from jaxid.errors import InputError
 from jaxid.first_case.balance import FreeSwing, RoughBalance, free_swing, rough_balance
 from jaxid.first_case.columns import NO_TIME_RATE, Chosen, Column
-from jaxid.first_case.joints import NO_FORCE_HINT, no_force
+from jaxid.first_case.joints import lacking_force
 from jaxid.first_case.raw import RawLog
 from jaxid.first_case.section import Section, rounded
 from jaxid.first_case.units import Measures
@@ -125,7 +124,7 @@ class Draft:
         servos = {drive.joint for drive in robot.drives if drive.kp is not None}
 
         if not chosen.force and not (chosen.reference and set(names) <= servos):
-            raise InputError(no_force(chosen), where=self._raw.source, hint=NO_FORCE_HINT)
+            raise lacking_force(chosen, self._raw.source)
         plant.keys["unknown"] = [*unknown]
         plant.notes["unknown"] = "the values of the file that are unknown, from the file's on"
         if measures.labels:
@@ -166,7 +165,7 @@ class Draft:
             time, position, _ = self._by_hand()
             swing = free_swing(position, float(np.median(np.diff(time))))
         if swing is None:
-            raise InputError(no_force(chosen), where=self._raw.source, hint=NO_FORCE_HINT)
+            raise lacking_force(chosen, self._raw.source)
         return [*self._swing(swing), self._log_table()]
 
     def _servo(self) -> list[Section]:
@@ -234,7 +233,7 @@ class Draft:
             names = [c.name for c in getattr(chosen, quantity)]
             if quantity == "velocity" and chosen.position and not self._velocity_counts():
                 continue
-            if names and joints:
+            if names and len(names) == len(joints):
                 section.keys[quantity] = dict(zip(joints, names, strict=True))
             elif names:
                 section.keys[quantity] = names[0] if len(names) == 1 else names
@@ -393,16 +392,17 @@ class Draft:
             key: list(value.values()) if isinstance(value, dict) and key != "units" else value
             for key, value in table.keys.items()
         }
+        driven = tuple(range(self._joints)) if self._chosen.driven is None else self._chosen.driven
         frame = Frame(
             motions=self._motions,
-            driven=tuple(range(self._joints)),
+            driven=driven,
             labels=self._measures.labels,
         )
         if self._empty():
             # A text table has such readings by itself; in other formats the case must say so.
             columns["resample"] = table.keys["resample"] = rounded(self._rate(), 6)
             table.assumed.append("values that are NaN are no readings: resampled at the rate of the log")
-        log = as_log(self._log, columns, joints=self._joints, drives=self._joints, frame=frame)
+        log = as_log(self._log, columns, joints=self._joints, drives=len(driven), frame=frame)
         table.assumed += [str(a) for a in log.assumed if not a.setting.startswith("units.")]
         return log
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +14,21 @@ from jaxid.first_case.columns import Chosen, Column
 from jaxid.first_case.words import meaning_of
 
 NO_FORCE_HINT = "log the torque or the current of the drives with its sign, and name it so"
+_SOME_FORCES_HINT = (
+    "name the robot's model by --mjcf or --urdf, which says what drives which joint; or write the case by "
+    "hand, as of a motor and a load (flexible_axis) or of masses in a row (chain with actuated)"
+)
 
 
-def of_tree(chosen: Chosen, names: tuple[str, ...], file: str, where: str) -> Chosen:
+def of_tree(
+    chosen: Chosen, names: tuple[str, ...], actuated: Collection[str], file: str, where: str
+) -> Chosen:
     """Return the columns of a robot's joints, in their order: of all, or of those that the log names.
 
     Args:
         chosen: Columns of the log.
         names: Names of the robot's free joints.
+        actuated: Names of those that its actuators drive; empty: all.
         file: The robot's file, for messages.
         where: The log, for messages.
 
@@ -31,9 +39,35 @@ def of_tree(chosen: Chosen, names: tuple[str, ...], file: str, where: str) -> Ch
     keys = [n if n in chosen.joints else " ".join(meaning_of(n).joint) for n in names]
     found = [k for k, key in enumerate(keys) if key and key in chosen.joints and keys.count(key) == 1]
     if not found or len(found) == len(names) or len(chosen.joints) == len(names):
-        return _of_joints(chosen, names, keys, file, where, "")
-    some = tuple(names[k] for k in found)
-    return _of_joints(chosen, some, [keys[k] for k in found], file, where, "; the others are held at zero")
+        picked = _of_joints(chosen, names, keys, file, where, "")
+    else:
+        some, words = tuple(names[k] for k in found), [keys[k] for k in found]
+        picked = _of_joints(chosen, some, words, file, where, "; the others are held at zero")
+    return _with_forces_of_driven(picked, actuated, file)
+
+
+def _with_forces_of_driven(chosen: Chosen, actuated: Collection[str], file: str) -> Chosen:
+    """Return the columns with the forces of the joints that actuators drive, if the others have none.
+
+    They belong to the joints by their names, or in their order if there are as many.
+    """
+    driven = tuple(k for k, name in enumerate(chosen.joints) if name in actuated)
+    loose = chosen.loose_forces
+    if not loose or not driven or len(driven) == len(chosen.joints):
+        return chosen
+    keys = [{chosen.joints[k], " ".join(meaning_of(chosen.joints[k]).joint)} for k in driven]
+    named = [[c for c in loose if " ".join(c.meaning.joint) in key] for key in keys]
+    if all(len(columns) == 1 for columns in named):
+        force = tuple(columns[0] for columns in named)
+    elif len(loose) == len(driven):
+        force = loose
+    else:
+        return chosen
+    joints = ", ".join(chosen.joints[k] for k in driven)
+    columns = ", ".join(f"'{c.name}'" for c in force)
+    said = f"only {joints} of {Path(file).name} {'has' if len(driven) == 1 else 'have'} an actuator"
+    said += f": {columns} {'is its force' if len(driven) == 1 else 'are their forces'}"
+    return replace(chosen, force=force, driven=driven, said=(*chosen.said, said))
 
 
 def of_arm(chosen: Chosen, arm: Urdf, urdf: str, where: str) -> Chosen:
@@ -91,11 +125,21 @@ def _of_joints(
 def need_forces(chosen: Chosen, where: str) -> None:
     """Refuse a log of several joints with neither a force nor a reference."""
     if not chosen.force and not chosen.reference:
-        raise InputError(no_force(chosen), where=where, hint=NO_FORCE_HINT)
+        raise lacking_force(chosen, where)
+
+
+def lacking_force(chosen: Chosen, where: str) -> InputError:
+    """Return the error that a log has no force, or not one for each joint that needs one."""
+    hint = _SOME_FORCES_HINT if chosen.loose_forces else NO_FORCE_HINT
+    return InputError(no_force(chosen), where=where, hint=hint)
 
 
 def no_force(chosen: Chosen) -> str:
-    """Return in words why a log has no force."""
+    """Return in words why a log has no force, or not one for each joint."""
+    if chosen.loose_forces:
+        listed = ", ".join(f"'{c.name}'" for c in chosen.loose_forces)
+        places = ", ".join(f"'{c.name}'" for c in chosen.position or chosen.velocity)
+        return f"{len(chosen.joints)} joints move ({places}), and not each has a force: {listed}"
     reasons = [line for line in chosen.said if line.startswith("'") and "passed over" in line]
     why = f" ({reasons[0]})" if reasons else ""
     return f"no column is a force with a sign{why}"
