@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
-from jaxid.dynamics.rhs import State
+from jaxid.dynamics.rhs import State, small_solve
 from jaxid.logs.log import Log
 from jaxid.logs.soundness import position_levels
 from jaxid.machine import Machine
@@ -43,7 +43,9 @@ class KalmanFilter(eqx.Module):
         command: Logged command at every tick, (ticks, m).
         readings: Readings at every tick, (ticks, n); between the samples of the log any number.
         used: Mask of the readings that correct the state, (ticks, n).
-        kicks: Standard deviation of a change of velocity that no force causes, at every tick, (ticks, n).
+        kicks: Standard deviation of a change of each joint's velocity by an unknown force on it, at every
+            tick, (ticks, n) [m/s or rad/s].
+        places: Positions at the samples, from which the motion of coupled joints is computed, (time, n).
         start: Position and velocity before the first reading, (2 n,).
         spread: Standard deviations of `start`, (2 n,).
         measured: Joints with an encoder.
@@ -56,6 +58,7 @@ class KalmanFilter(eqx.Module):
     readings: Float[Array, "ticks n"]
     used: Bool[Array, "ticks n"]
     kicks: Float[Array, "ticks n"]
+    places: Float[Array, "time n"]
     start: Float[Array, " 2n"]
     spread: Float[Array, " 2n"]
     measured: tuple[int, ...] = eqx.field(static=True)
@@ -86,6 +89,7 @@ class KalmanFilter(eqx.Module):
         x, unravel = ravel_pytree(x0)
         size, m = x.size, before.shape[1]
         moving, speeds = jnp.arange(2 * n), n + jnp.arange(n)
+        jolts = self._jolts(plant)
         p = jnp.zeros((size, size)).at[moving, moving].set(self.spread**2)
 
         advance = drive.stepper(plant, x0, (before[0],) if held else (before[0], after[0]))
@@ -93,7 +97,7 @@ class KalmanFilter(eqx.Module):
 
         def tick(carry: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
             x, p = carry
-            u0, u1, t, reading, used, kicks = now
+            u0, u1, t, reading, used, jolt = now
 
             innovations, variances = [], []
             for i, j in enumerate(self.measured):
@@ -112,13 +116,37 @@ class KalmanFilter(eqx.Module):
             jacobian, x = jax.jacfwd(step, has_aux=True)(jnp.concatenate([x, jnp.zeros(m)]))
             a, b = jacobian[:, :size], jacobian[:, size:]
             p = a @ p @ a.T + (b * force_variance) @ b.T
-            p = p.at[speeds, speeds].add(kicks**2)
+            p = p.at[speeds, speeds].add(jolt) if jolt.ndim == 1 else p.at[n : 2 * n, n : 2 * n].add(jolt)
             return (x, 0.5 * (p + p.T)), (jnp.stack(innovations), jnp.stack(variances))
 
         times = drive.period * jnp.arange(self.command.shape[0])
-        inputs = (before, after, times, self.readings, self.used, self.kicks)
+        inputs = (before, after, times, self.readings, self.used, jolts)
         out = jax.lax.scan(tick, (x, p), inputs)[1]
         return out[0][:: self.every], out[1][:: self.every]
+
+    def _jolts(self, plant: Plant) -> Array:
+        """Return the covariance of the change of velocity at every tick: (ticks, n, n), or its diagonal.
+
+        A force on one of several coupled joints accelerates the others too: by the column of the inverse
+        mass matrix.
+        """
+        if not plant.coupled or self.kicks.shape[1] == 1:
+            return self.kicks**2
+        kicks, one = self.kicks[:: self.every], jnp.eye(self.kicks.shape[1])
+
+        def mass(q: Array) -> Array:
+            still = jnp.zeros_like(q)
+            return jax.jacfwd(lambda qdd: plant.inertial(q, still, qdd))(still)
+
+        # Where nothing is unknown the matrix does not matter, and may be singular.
+        known = ~jnp.any(kicks > 0, axis=1)
+        masses = jnp.where(known[:, None, None], one, jax.vmap(mass)(self.places))
+        by_force = jax.vmap(small_solve, in_axes=(None, 0), out_axes=1)
+        inverse = jax.vmap(by_force, in_axes=(0, None))(masses, one)
+        push = inverse / jnp.diagonal(inverse, axis1=1, axis2=2)[:, None]
+        at_samples = jnp.einsum("tij,tj,tkj->tik", push, kicks**2, push)
+        every_tick = jnp.zeros((len(self.kicks), *one.shape))
+        return every_tick.at[:: self.every].set(at_samples)
 
 
 def make_filter(
@@ -157,6 +185,7 @@ def make_filter(
         readings=readings,
         used=used,
         kicks=kicks,
+        places=log.filled,
         start=np.concatenate([replay.position, replay.velocity]),
         spread=np.concatenate([unsure, speed]),
         measured=tuple(np.flatnonzero(log.measured).tolist()),

@@ -114,3 +114,46 @@ def cart_log(text: str, seconds: float = 10.0, rate: int = 500, seed: int = 0) -
     columns = {"t": np.arange(count) / rate}
     columns |= {f"q_{name}": q[:, k] for k, name in enumerate(CART_JOINTS)}
     return columns | {f"u_{name}": u[:, k] for k, name in enumerate(CART_JOINTS)}
+
+
+# A cart that a motor drives, with a pendulum that nothing drives.
+PENDULUM_ON_CART = """
+<mujoco>
+  <option gravity="0 0 -9.81" timestep="0.0001" integrator="implicitfast"/>
+  <worldbody>
+    <body><joint name="slide" type="slide" axis="1 0 0" {slide}/>
+      <inertial pos="0 0 0" mass="1.2" diaginertia="0.01 0.01 0.01"/>
+      <body><joint name="swing" axis="0 1 0" {swing}/>
+        <inertial pos="0 0 -0.25" mass="0.3" diaginertia="0.007 0.007 0.0001"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="slide"/></actuator>
+</mujoco>
+"""
+
+
+def pendulum_log(slide: str, swing: str, seconds: float = 20.0, rate: int = 500) -> dict[str, np.ndarray]:
+    """Columns of a log by MuJoCo: the cart under PD control, with rounded readings and a noisy force.
+
+    Args:
+        slide, swing: Attributes of the joints in MJCF.
+        seconds: Length of the log [s].
+        rate: Sampling rate [Hz].
+    """
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(PENDULUM_ON_CART.format(slide=slide, swing=swing))
+    data, rng = mujoco.MjData(model), np.random.default_rng(3)
+    inner, count = round(1 / rate / model.opt.timestep), round(seconds * rate)
+    steps = np.array([2e-5, 2 * np.pi / 8192])
+    t = np.arange(count) / rate
+    wanted = sum(a * np.sin(2 * np.pi * f * t) for a, f in ((0.25, 0.4), (0.1, 1.1), (0.05, 2.3)))
+    q, u, before = np.zeros((count, 2)), np.zeros(count), 0.0
+    for k in range(count):
+        q[k] = np.round(data.qpos / steps) * steps
+        u[k] = np.clip(120 * (wanted[k] - q[k, 0]) - 12 * (q[k, 0] - before) * rate, -30, 30)
+        before, data.ctrl[0] = q[k, 0], u[k]
+        for _ in range(inner):
+            mujoco.mj_step(model, data)
+    return {"t": t, "slide pos": q[:, 0], "swing pos": q[:, 1], "F [N]": u + 0.05 * rng.normal(size=count)}
