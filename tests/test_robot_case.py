@@ -7,15 +7,17 @@ import mujoco
 import numpy as np
 import pytest
 
+import jaxid
 from jaxid.case.case import load_case
 from jaxid.cli import main
 from jaxid.commands.discover import discover
 from jaxid.commands.init import init
-from jaxid.commands.robot_case import RobotCase, let_go
+from jaxid.commands.robot_case import RobotCase, implied_case, let_go
 from jaxid.errors import InputError
 from jaxid.session import open_session
 from tests.export.test_replayed import SERVOS, TRUE, logged, text
 from tests.support.cli_setup import run
+from tests.support.mjcf_robots import PENDULUM_ON_CART
 from tests.support.urdf_arms import arm
 from tests.support.written_logs import write_csv
 
@@ -48,6 +50,17 @@ def test_a_robot_and_its_log_imply_a_case(folder):
     assert case.tables["plant"]["mjcf"] == "../robot.xml"
 
 
+@pytest.mark.parametrize("of", [jaxid.identify, jaxid.discover])
+def test_python_takes_a_robots_file_for_a_case_too(folder, of):
+    with pytest.raises(InputError, match="a robot's file alone has no log"):
+        of(folder / "robot.xml")
+    with pytest.raises(InputError, match="no such file"):
+        of(folder / "robot.xml", folder / "absent.csv")
+    case = implied_case(folder / "robot.xml", [str(folder / "log.csv")], search=of is jaxid.discover)
+    made = RobotCase.of(str(folder / "robot.xml"), [str(folder / "log.csv")], search=of is jaxid.discover)
+    assert case == made.tables
+
+
 def test_joints_that_the_log_lacks_are_held(folder):
     t = np.arange(100) / 100
     columns = {"t": t, "q_b": np.sin(3 * t), "torque_b": np.cos(7 * t)}
@@ -62,18 +75,9 @@ def test_joints_that_the_log_lacks_are_held(folder):
     assert any("the others are held at zero" in line for line in first.assumed)
 
 
-PENDULUM_ON_CART = """
-<mujoco><worldbody><body><joint name="slide" type="slide" axis="1 0 0"/>
-<inertial pos="0 0 0" mass="1.2" diaginertia="0.01 0.01 0.01"/>
-<body><joint name="swing" axis="0 1 0"/>
-<inertial pos="0 0 -0.25" mass="0.3" diaginertia="0.007 0.007 0.0001"/></body></body></worldbody>
-<actuator><motor joint="slide"/></actuator></mujoco>
-"""
-
-
 @pytest.mark.parametrize("force", ["F [N]", "slide torque [N]"])
 def test_joints_without_an_actuator_need_no_force(tmp_path, force):
-    (tmp_path / "cart.xml").write_text(PENDULUM_ON_CART)
+    (tmp_path / "cart.xml").write_text(PENDULUM_ON_CART.format(slide="", swing=""))
     t = np.arange(400) / 100
     columns = {"t": t, "x [m]": np.sin(2 * t), "theta [rad]": np.cos(3 * t), force: np.cos(7 * t)}
     if force != "F [N]":

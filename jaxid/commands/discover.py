@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from jaxid.case.case import Case, CaseLike
 from jaxid.case.user_faults import named_faults
+from jaxid.commands.robot_case import implied_case
 from jaxid.consistency.absent import acts_by_position
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.naming import Found, named_at_rest
@@ -86,7 +87,8 @@ def discover(
     """Find the effects that a case's model lacks, from a log.
 
     Args:
-        case: The case, its file, or a dict with its tables.
+        case: The case, its file, or a dict with its tables; or a robot's file in MJCF or URDF, with which the
+            log implies a case.
         log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict).
         validate: Logs that must confirm each effect, beside those of the case.
         max_effects: Largest number of effects to add, without a force at each joint of an arm. None: five, or
@@ -103,6 +105,7 @@ def discover(
     if solver is not None and solver not in SOLVERS:
         raise InputError(f"solver {solver!r} is not known", hint=suggest(solver, SOLVERS))
     minimiser_of(minimiser)
+    case = implied_case(case, log, search=True)
     session = open_session(case, log, validate, align_hold=True, method="discover")
     session = replace(session, case=_with_numerics(session.case, solver, minimiser))
     return explore(session, max_effects=max_effects, refit=refit, experiments=experiments, progress=progress)

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.case.user_faults import named_faults
+from jaxid.commands.robot_case import implied_case
 from jaxid.errors import InputError, suggest
 from jaxid.estimators import refuse_without_likelihood, steps_of
 from jaxid.estimators.choice import choose_method, with_choice
@@ -87,7 +88,8 @@ def identify(
     """Identify the unknowns of a case from a log, or from several together.
 
     Args:
-        case: The case, its file, or a dict with its tables.
+        case: The case, its file, or a dict with its tables; or a robot's file in MJCF or URDF, with which the
+            log implies a case.
         log: The log, its file, or a table of the columns that [log] names (DataFrame, Dataset, dict); or a
             list of several. They are fitted with the logs of [[fit]]; None: those alone.
         method: One of `jaxid.names.METHODS`, or a registered one; None: chosen from case and log, with the
@@ -112,7 +114,7 @@ def identify(
     if method is not None:
         _check_method(method)
     options = _checked_options(method, solver, minimiser, on, hessian, profile)
-    case = load_case(case)
+    case = load_case(implied_case(case, log))
     session = open_session(case, log, validate, method=method, piecewise=_piecewise(case, method, options))
     need_names(options.get("profile", session.case.identification.profile), session.machine.parameters.names)
     if not session.machine.parameters.free:

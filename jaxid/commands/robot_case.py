@@ -13,10 +13,13 @@ from jaxid.case.urdf import read_urdf_tree
 from jaxid.commands.init import FirstCase, init
 from jaxid.errors import InputError
 from jaxid.files import write_whole
-from jaxid.names import FIRST_CASE
+from jaxid.names import FIRST_CASE, ROBOT_FILES
 
 if TYPE_CHECKING:
+    from jaxid.case.case import CaseLike
     from jaxid.commands.identify import Identification
+    from jaxid.logs.in_memory import LogLike
+    from jaxid.session import Logs
 
 # Simulation of a robot that is let go: its length [s], and the most samples a second.
 _SECONDS, _RATE = 5.0, 500.0
@@ -50,10 +53,9 @@ class RobotCase:
         Raises:
             InputError: If there is no log, or the file or the log is unsound.
         """
-        if not logs:
-            hint = "name the log behind the robot's file, or give a case"
-            raise InputError("a robot's file alone has no log", where=robot, hint=hint)
         path = Path(robot)
+        if not logs:
+            raise _no_log(path)
         unknown = _of_file(_read(path)) if search else None
         return cls(path, logs[0], unknown, _first(path, logs[0], unknown, Path()))
 
@@ -95,6 +97,31 @@ class RobotCase:
         return "\n".join([*lines, "", str(replayed)])
 
 
+def implied_case(case: CaseLike, log: Logs, *, search: bool = False) -> CaseLike:
+    """Return the case that a robot's file and a log imply; any other case as it is.
+
+    Args:
+        case: The case, or a robot's file in MJCF or URDF in its place.
+        log: The log, or a list of several, of which the first one shows the columns.
+        search: Whether effects are to be searched for, see `RobotCase.of`.
+
+    Raises:
+        InputError: If there is no log for a robot's file, or one of the two is unsound.
+    """
+    if not isinstance(case, (str, Path)) or Path(case).suffix.lower() not in ROBOT_FILES:
+        return case
+    first = log[0] if isinstance(log, (list, tuple)) and log else log
+    if first is None or isinstance(first, (list, tuple)):
+        raise _no_log(Path(case))
+    unknown = _of_file(_read(Path(case))) if search else None
+    return _first(Path(case), first, unknown, Path()).tables
+
+
+def _no_log(robot: Path) -> InputError:
+    hint = "name the log behind the robot's file, or give a case"
+    return InputError("a robot's file alone has no log", where=str(robot), hint=hint)
+
+
 def found_file(robot: str) -> str:
     """Return the name of a robot's file with a result in it."""
     path = Path(robot)
@@ -124,7 +151,7 @@ def _read(path: Path) -> Robot:
     return read_urdf_tree(path) if path.suffix.lower() == ".urdf" else read_mjcf(path)
 
 
-def _first(path: Path, log: str, unknown: tuple[str, ...] | None, folder: Path) -> FirstCase:
+def _first(path: Path, log: LogLike, unknown: tuple[str, ...] | None, folder: Path) -> FirstCase:
     if path.suffix.lower() == ".urdf":
         return init(log, urdf=path, tree=True, unknown=unknown, folder=folder)
     return init(log, mjcf=path, unknown=unknown, folder=folder)
