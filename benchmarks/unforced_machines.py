@@ -109,6 +109,10 @@ class Servo:
         log = self.run()
         return {"t": log["t"], "q": log["position"], "r": self.command}
 
+    def label(self, kind: str, port: int) -> str:
+        """Return the name of an effect in the records: a servo has one joint."""
+        return kind
+
     def truth(self) -> dict[str, float]:
         """Return the values of the declared unknowns by the names of results."""
         out = {"inertia": self.inertia, "controller.kp": self.kp, "controller.kd": self.kd}

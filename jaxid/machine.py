@@ -37,6 +37,8 @@ class Machine:
         unknown_reference: Reference with unknowns, for logs without a reference; None: it is known.
         load: Known forces in the loop that the plant takes behind those of its drives, at the samples of a
             log, (time, loads) [N or N m]; None: there are none. See `jaxid.plants.loaded_axis`.
+        held_load: The same as means over the ticks of the loop, (ticks, loads), which a simulation then takes
+            in place of `load`; None: they are not known so finely.
     """
 
     plant: Plant
@@ -50,6 +52,7 @@ class Machine:
     reference_hold: str = "band_limited"
     unknown_reference: UnknownReference | None = None
     load: Float[np.ndarray, "time loads"] | None = None
+    held_load: Float[np.ndarray, "ticks loads"] | None = None
 
     @property
     def hold_period(self) -> float | None:

@@ -34,7 +34,7 @@ class OpenedLog:
         reference_hold: Course of the reference between samples that is stated for this log only; None: that
             of the machine.
         own: Values that hold in this log only; None: there are none.
-        load: Known forces along this log, see `jaxid.machine.Machine`; None: there are none.
+        load, held_load: Known forces along this log, see `jaxid.machine.Machine`; None: there are none.
     """
 
     name: str
@@ -44,12 +44,14 @@ class OpenedLog:
     reference_hold: str | None = None
     own: OwnValues | None = None
     load: Float[np.ndarray, "time loads"] | None = None
+    held_load: Float[np.ndarray, "ticks loads"] | None = None
 
     def machine(self, machine: Machine) -> Machine:
         """Return a machine with the values, the disturbance and the course of the reference of this log."""
         hold = self.reference_hold or machine.reference_hold
         own = machine if self.own is None else self.own.machine(machine)
-        return replace(own, disturbance=self.disturbance, reference_hold=hold, load=self.load)
+        known = {"load": self.load, "held_load": self.held_load}
+        return replace(own, disturbance=self.disturbance, reference_hold=hold, **known)
 
 
 @dataclass(frozen=True)

@@ -208,7 +208,15 @@ def make_replay(machine: Machine, log: Log, numerics: Numerics | None = None) ->
 
 
 def _load_at(machine: Machine, log: Log, times: np.ndarray) -> np.ndarray | None:
-    """Return the known load of a machine at some times, (times, m); None if there is none."""
+    """Return the known load of a machine at some times, (times, m); None if there is none.
+
+    Args:
+        machine: The machine.
+        log: Its log.
+        times: The middles of all ticks [s].
+    """
+    if machine.held_load is not None:
+        return machine.held_load
     return None if machine.load is None else reference_at(log.time, machine.load, times, "linear")
 
 

@@ -1,8 +1,9 @@
 """Search for what an arm of servos lacks, joint by joint, in logs without a force.
 
 The loop of a whole arm takes hours to search. In its own loop each joint is an axis, whose load is that of
-the links along the measured motion of all joints (`jaxid.estimators.apart`). Each is searched as an axis is
-(`jaxid.discovery.in_loop.unforced`), and what was found is put together on the arm.
+the links along the motion of all joints (`jaxid.estimators.apart`): the measured one at first, and then that
+of the simulated arm. Each is searched as an axis is (`jaxid.discovery.in_loop.unforced`), and what was found
+is put together on the arm.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from jaxid.discovery.in_loop.unforced import (
     UNSEEN,
     explored_from,
     open_joints,
+    refitted,
     verdict_without_effects,
     where_in_time,
 )
@@ -25,6 +27,7 @@ from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.errors import InputError
 from jaxid.estimators.apart.joint import JointAlone, joints_alone
+from jaxid.estimators.apart.loads import with_simulated_loads
 from jaxid.estimators.apart.session import session_of_joint
 from jaxid.estimators.apart.steps import joint_fits, of_arm
 from jaxid.estimators.effort import with_effort
@@ -36,6 +39,10 @@ from jaxid.model.effect import Effect
 from jaxid.model.unknowns import free_effect, label
 from jaxid.numerics.lanes import run_alone
 from jaxid.session import Session
+from jaxid.simulation.sensor_noise import position_noise
+
+# Number of times that the loads are renewed before the search and after it: fits and loads come closer.
+_RENEWALS = 2
 
 
 def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
@@ -52,11 +59,18 @@ def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[
     progress("fitting the declared model, joint by joint")
     arm = ArmSearch.of(session)
     found: dict[int, Discovery] = {}
-    for number, joint in enumerate(arm.declared, start=1):
+    # What is found at one joint changes the forces on the others: the joint that leaves most is the first.
+    while left := [joint for joint in arm.by_excess if joint not in found]:
+        joint, number = left[0], len(found) + 1
         at_joint = _prefixed(progress, f"{joint_words(session, joint)} ({number} of {len(arm.declared)})")
         found[joint] = arm.searched(joint, max_effects=max_effects, progress=at_joint)
+        if found[joint].effects and len(left) > 1:
+            arm = arm.renewed(found)
     progress("simulating the whole arm")
-    return arm.together(found)
+    if any(d.effects for d in found.values()):
+        for _ in range(_RENEWALS):
+            found = arm.refined(found)
+    return arm.together({joint: found[joint] for joint in sorted(found)})
 
 
 @dataclass(frozen=True)
@@ -89,9 +103,65 @@ class ArmSearch:
         if not moving:
             hint = "name as reference the columns of the commands, in the order of the joints"
             raise InputError("no joint's command moves in the logs", where=session.case.where, hint=hint)
-        stated, demands = session.case.output_error, session.case.identification
-        fits = run_alone(joint_fits(moving, minimiser=stated.minimiser, hessian=demands.hessian))
-        return cls(session, parts, every, {a.joint: fit for a, fit in zip(moving, fits, strict=True)})
+        fits = _fitted(session, moving)
+        arm = cls(session, parts, every, {a.joint: fit for a, fit in zip(moving, fits, strict=True)})
+        for _ in range(_RENEWALS):
+            arm = arm.renewed({})
+        return arm
+
+    @property
+    def by_excess(self) -> list[int]:
+        """The joints that move, first the one whose fit leaves most over the noise of its encoder."""
+
+        def excess(joint: int) -> float:
+            fit = self.declared[joint]
+            floor = position_noise(fit.machine, self._alone(joint).parts[0].log)[0]
+            return float(np.sqrt(np.mean(np.square(fit.residual)))) / max(float(floor), 1e-300)
+
+        return sorted(self.declared, key=lambda joint: -excess(joint))
+
+    def _alone(self, joint: int) -> JointAlone:
+        return next(alone for alone in self.every if alone.joint == joint)
+
+    def renewed(self, found: Mapping[int, Discovery]) -> ArmSearch:
+        """Return the arm with the loads of its simulation, and refits of joints to which these come closer.
+
+        Args:
+            found: Joints that were searched, which keep their fits.
+        """
+        open_ones = [a for a in self.every if a.joint in self.declared and a.joint not in found]
+        begun = [a.with_estimate(self.declared[a.joint].theta) for a in open_ones]
+        tried = self._with_loads(begun, found)
+        fits = dict(zip([a.joint for a in tried], _fitted(self.session, tried), strict=True))
+        better = {a.joint: a for a in tried if _squares(fits[a.joint]) < _squares(self.declared[a.joint])}
+        declared = {j: fits[j] if j in better else fit for j, fit in self.declared.items()}
+        return replace(self, every=[better.get(a.joint, a) for a in self.every], declared=declared)
+
+    def refined(self, found: Mapping[int, Discovery]) -> dict[int, Discovery]:
+        """Return searches whose models are refitted with the loads of the arm that was found, if they gain.
+
+        Args:
+            found: Search of each joint.
+        """
+        machine, names = _with_effects(self.session.machine, found)
+        joints = [_fuller(alone, machine, found, names) for alone in self.every if alone.joint in found]
+        out = dict(found)
+        for alone in self._with_loads(joints, found):
+            own, d = session_of_joint(self.session, alone), found[alone.joint]
+            fit = refitted(own, d.after.machine, None)
+            if _squares(fit) < _squares(d.after):
+                out[alone.joint] = replace(d, after=fit)
+        return out
+
+    def _with_loads(self, joints: Sequence[JointAlone], found: Mapping[int, Discovery]) -> list[JointAlone]:
+        """Return joints with the loads of the simulated arm, with what was found at some of its joints."""
+        machine, names = _with_effects(self.session.machine, found)
+        known = {**self.declared, **{joint: d.after for joint, d in found.items()}}
+        theta = machine.parameters.guess
+        for alone in (_fuller(one, machine, found, names) for one in self.every):
+            if alone.joint in known:
+                theta[alone.index] = alone.of_arm(known[alone.joint].theta)
+        return with_simulated_loads(joints, theta, [part_of(run, machine) for run in self.session.runs])
 
     def searched(self, joint: int, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
         """Search one joint alone, from the fit of the declared model.
@@ -100,8 +170,7 @@ class ArmSearch:
             joint: Its number, from 0.
             max_effects, progress: See `explore_by_joint`.
         """
-        alone = next(alone for alone in self.every if alone.joint == joint)
-        before = self.declared[joint]
+        alone, before = self._alone(joint), self.declared[joint]
         own = session_of_joint(self.session, alone.with_estimate(before.theta))
         return explored_from(own, before, max_effects=max_effects, progress=progress, effort=FEW)
 
@@ -145,6 +214,18 @@ class ArmSearch:
             unseen=UNSEEN,
             joints=joints,
         )
+
+
+def _fitted(session: Session, joints: Sequence[JointAlone]) -> list[Estimate]:
+    """Return the fits of joints, each alone."""
+    stated, demands = session.case.output_error, session.case.identification
+    return run_alone(joint_fits(joints, minimiser=stated.minimiser, hessian=demands.hessian))
+
+
+def _squares(fit: Estimate) -> float:
+    """Return the squared residual of a fit; infinite if it diverged."""
+    total = float(np.sum(np.square(fit.residual)))
+    return total if np.isfinite(total) else np.inf
 
 
 def joint_words(session: Session, joint: int) -> str:

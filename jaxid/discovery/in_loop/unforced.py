@@ -98,7 +98,7 @@ def explored_from(
     alternatives = search.alternatives(steps)
     final, effects = final_machine(fitted, search, alternatives, steps)
     progress("refitting in simulation")
-    after = _refitted(session, final, base) if effects else before
+    after = refitted(session, final, base) if effects else before
     if effects:
         after = replace(after, notes=(*after.notes, _UNPROVEN))
 
@@ -266,8 +266,14 @@ def _run(replay: Replay, plant: Plant) -> Trajectory:
     return replay(plant)
 
 
-def _refitted(session: Session, final: Machine, base: int | None) -> Estimate:
-    """Refit a machine with what was found, from its values; the scale stays free if nothing gives it."""
+def refitted(session: Session, final: Machine, base: int | None) -> Estimate:
+    """Refit a machine with what was found, from its values; the scale stays free if nothing gives it.
+
+    Args:
+        session: Case and logs.
+        final: The machine.
+        base: Index of the unknown that gave the scale, which `final` holds; None if something known does.
+    """
     stated, demands = session.case.output_error, session.case.identification
     options: dict[str, Any] = {"minimiser": stated.minimiser, "hessian": demands.hessian}
     held = None

@@ -122,7 +122,7 @@ def joints_alone(machine: Machine, parts: Sequence[Part], others: Sequence[Part]
     """
     loads, inertias = [], []
     for part in (*parts, *others):
-        force, own = _of_links(_links(part.machine), *(getattr(part.data, n) for n in ("q", "qd", "qdd")))
+        force, own = of_links(links_of(part.machine), *(getattr(part.data, n) for n in ("q", "qd", "qdd")))
         loads.append(np.asarray(force))
         inertias.append(np.asarray(own))
     means = np.mean(np.concatenate(inertias[: len(parts)]), axis=0)
@@ -165,7 +165,7 @@ def _joint_of(f: Free, machine: Machine) -> int | None:
     return f.index if f.path == (_ROTOR,) and isinstance(f.index, int) else None
 
 
-def _links(machine: Machine) -> LinkTree:
+def links_of(machine: Machine) -> LinkTree:
     """Return the links of an arm alone."""
     assert isinstance(machine.plant, LinkTree), "checked by stands_apart"
     return replace(machine.plant, effects=(), rotor_inertia=None)
@@ -177,7 +177,7 @@ def _ratios(plant: Any) -> np.ndarray:
 
 
 @kept_jit
-def _of_links(plant: LinkTree, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
+def of_links(plant: LinkTree, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
     """Return the forces of the links along a motion, (time, n), and inertias of joints at some rows."""
     every = max(1, len(q) // _ROWS)
     zero = jnp.zeros(q.shape[1])

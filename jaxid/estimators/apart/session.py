@@ -24,11 +24,19 @@ def session_of_joint(session: Session, alone: JointAlone) -> Session:
     def opened(run: OpenedLog, k: int, of: str) -> OpenedLog:
         part = getattr(alone, of)[k]
         own = _own(run.own, session.machine, alone)
-        return replace(run, log=part.log, data=part.data, own=own, load=part.machine.load)
+        return replace(
+            run,
+            log=part.log,
+            data=part.data,
+            own=own,
+            load=part.machine.load,
+            held_load=part.machine.held_load,
+        )
 
     first, *more = (opened(fits[part.name], k, "parts") for k, part in enumerate(alone.parts))
     others = tuple(opened(validations[part.name], k, "others") for k, part in enumerate(alone.others))
-    machine = replace(alone.machine, load=alone.parts[0].machine.load)
+    first_machine = alone.parts[0].machine
+    machine = replace(alone.machine, load=first_machine.load, held_load=first_machine.held_load)
     return replace(session, machine=machine, fit=first, more=tuple(more), validations=others, findings=())
 
 

@@ -1,0 +1,111 @@
+"""Loads of an arm's joints from the simulated motion of the whole arm.
+
+The encoders show a motion only as far as their rows and their noise let it be differentiated: jerks of a
+servo between two rows, as at every change of a command that is held, push the other joints unseen. Here the
+loop of the arm is simulated from its commands, and the load at every tick is that of the simulated motion.
+What the measured motion has beside it, through the same filter, is added, unless noise explains it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.estimators.apart.joint import JointAlone, links_of, of_links
+from jaxid.estimators.several.parts import Part
+from jaxid.logs.prepare import motion
+from jaxid.machine import Machine
+from jaxid.model.plant import Plant
+from jaxid.numerics.kept import kept_jit
+from jaxid.simulation.loops import Trajectory
+from jaxid.simulation.reference_course import reference_at
+from jaxid.simulation.replay import Replay, make_replay
+from jaxid.simulation.sensor_noise import position_noise
+
+# Squares that a simulation leaves, over those of the encoder's noise, up to which its motion is taken whole.
+_EXPLAINED = 1.5
+
+
+def with_simulated_loads(
+    joints: Sequence[JointAlone], theta: Float[np.ndarray, " p"], parts: Sequence[Part]
+) -> list[JointAlone]:
+    """Return joints whose loads are those of the simulated arm; along a log that diverges they stay.
+
+    Args:
+        joints: The joints, each with any of the logs.
+        theta: Unknowns of the arm at which it is simulated.
+        parts: All logs, with the machines of the arm.
+    """
+    motions = {part.name: _Motions.of(part.at(theta), part) for part in parts}
+
+    def renewed(alone: JointAlone, part: Part) -> Part:
+        found = motions[part.name]
+        if found is None:
+            return part
+        load = found.load(alone.joint, alone.links)
+        return replace(part, machine=replace(part.machine, held_load=load))
+
+    return [
+        replace(
+            alone,
+            parts=tuple(renewed(alone, part) for part in alone.parts),
+            others=tuple(renewed(alone, part) for part in alone.others),
+        )
+        for alone in joints
+    ]
+
+
+class _Motions:
+    """Acceleration and force of the links along the motions of a log.
+
+    Args:
+        inside: Mean acceleration over every tick of the simulation, and the links' force, (ticks, n) each.
+        beside: What the measured motion has more of both, by row and joint; the same at every tick.
+    """
+
+    def __init__(self, inside: tuple[np.ndarray, np.ndarray], beside: tuple[np.ndarray, np.ndarray]) -> None:
+        self.acceleration = inside[0] + beside[0]
+        self.force = inside[1] + beside[1]
+
+    def load(self, joint: int, links: float) -> Float[np.ndarray, "ticks 1"]:
+        """Return the force on a joint beside that of a constant inertia of its links."""
+        return (links * self.acceleration - self.force)[:, joint : joint + 1]
+
+    @classmethod
+    def of(cls, machine: Machine, part: Part) -> _Motions | None:
+        """Return the motions of an arm along a log; None if its simulation diverges."""
+        log, law = part.log, machine.controller
+        assert law is not None, "checked by stands_apart"
+        replay = make_replay(machine, log)
+        run = _run(replace(replay, every=1), machine.plant)
+        q, v = np.asarray(run.position), np.asarray(run.velocity)
+        if not np.all(np.isfinite(q)) or not np.all(np.isfinite(v)):
+            return None
+        links = links_of(machine)
+        middle, speed = (np.concatenate([0.5 * (x[1:] + x[:-1]), x[-1:]]) for x in (q, v))
+        a = np.diff(v, axis=0, append=v[-1:]) / law.period
+        inside = a, np.asarray(of_links(links, middle, speed, a)[0])
+
+        recipe, rows = part.data.recipe, q[:: replay.every]
+        seen = motion(
+            replace(log, position=rows), recipe.cutoff_hz, recipe.order, recipe.derivatives, recipe.reach
+        )
+        unexplained = _EXPLAINED * np.square(position_noise(machine, log)) < np.mean(
+            np.square(log.filled - rows), axis=0
+        )
+        measured = [
+            np.where(unexplained, x, y)
+            for x, y in zip((part.data.q, part.data.qd, part.data.qdd), seen, strict=True)
+        ]
+        more = measured[2] - seen[2], np.asarray(of_links(links, *measured)[0] - of_links(links, *seen)[0])
+        times = log.time[0] + law.period * (np.arange(len(q)) + 0.5)
+        at_ticks = (reference_at(log.time, x, times, "linear") for x in more)
+        return cls(inside, (next(at_ticks), next(at_ticks)))
+
+
+@kept_jit
+def _run(replay: Replay, plant: Plant) -> Trajectory:
+    return replay(plant)

@@ -1,0 +1,69 @@
+"""Loads of an arm's joints from its simulated motion; logs by the exact stepper."""
+
+import numpy as np
+import pytest
+
+from benchmarks.unforced import of
+from benchmarks.unforced_machines import NOISE
+from jaxid.estimators.apart.joint import JointAlone, joints_alone
+from jaxid.estimators.apart.loads import with_simulated_loads
+from jaxid.estimators.several.parts import parts_of
+from jaxid.gap import simulation_of_log
+from jaxid.session import open_session
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """A complete arm whose commands are held over four ticks: it jerks between the rows of its log."""
+    drawn = of("arm_nulls", 0)
+    assert drawn.every == 4
+    session = open_session(drawn.case(), drawn.columns())
+    parts = parts_of(session)
+    return drawn, session, parts, joints_alone(session.machine, parts)
+
+
+def true_values(drawn, alone: JointAlone) -> np.ndarray:
+    """The joint's own values, in the order of its unknowns."""
+    servo, out = drawn.servos[alone.joint], []
+    for f in alone.machine.parameters.free:
+        if f.path == ("inertia",):
+            out.append(alone.links + servo.rotor)
+        elif f.path[-1] == "delay":
+            out.append(servo.effects["command_delay"]["delay"])
+        elif f.path[0] == "controller":
+            out.append(getattr(servo, f.path[-1]))
+        else:
+            kind = alone.machine.plant.effects[f.path[1]].kind
+            out.append(servo.effects[kind][f.path[-1]])
+    return np.array(out)
+
+
+def left(drawn, alone: JointAlone) -> float:
+    """RMS of the position that the true values of a joint leave, over the noise of its encoder."""
+    (part,) = alone.with_estimate(true_values(drawn, alone)).parts
+    off = simulation_of_log(part.machine, part.log).position - part.log.filled
+    return float(np.sqrt(np.mean(off**2) / (NOISE**2 + drawn.count**2 / 12)))
+
+
+@pytest.mark.slow
+def test_true_values_leave_noise_with_the_loads_of_the_simulation(arm):
+    drawn, session, parts, joints = arm
+    theta = session.machine.parameters.guess
+    for alone in joints:
+        theta[alone.index] = alone.of_arm(true_values(drawn, alone))
+    measured = [left(drawn, alone) for alone in joints]
+    simulated = [left(drawn, alone) for alone in with_simulated_loads(joints, theta, parts)]
+    assert min(measured) > 2.0
+    assert max(simulated) < 1.3
+
+
+@pytest.mark.slow
+def test_a_model_that_is_wrong_still_gives_better_loads_than_the_encoders_alone(arm):
+    """All values are 10 % off; what the simulation lacks is taken from the measured motion."""
+    drawn, session, parts, joints = arm
+    theta = session.machine.parameters.guess
+    for alone in joints:
+        off = np.where(np.arange(len(alone.index)) % 2, 1.1, 0.9)
+        theta[alone.index] = off * alone.of_arm(true_values(drawn, alone))
+    for before, after in zip(joints, with_simulated_loads(joints, theta, parts), strict=True):
+        assert left(drawn, after) < 0.8 * left(drawn, before)
