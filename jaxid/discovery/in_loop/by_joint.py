@@ -41,7 +41,7 @@ from jaxid.numerics.lanes import run_alone
 from jaxid.session import Session
 from jaxid.simulation.sensor_noise import position_noise
 
-# Number of times that the loads are renewed before the search and after it: fits and loads come closer.
+# Number of times that the loads are renewed before a search and after it: fits and loads come closer.
 _RENEWALS = 2
 
 
@@ -64,12 +64,12 @@ def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[
         joint, number = left[0], len(found) + 1
         at_joint = _prefixed(progress, f"{joint_words(session, joint)} ({number} of {len(arm.declared)})")
         found[joint] = arm.searched(joint, max_effects=max_effects, progress=at_joint)
-        if found[joint].effects and len(left) > 1:
-            arm = arm.renewed(found)
+        if found[joint].effects:
+            at_joint("simulating the arm with what was found")
+            for _ in range(_RENEWALS):
+                found = arm.refined(found)
+                arm = arm.renewed(found)
     progress("simulating the whole arm")
-    if any(d.effects for d in found.values()):
-        for _ in range(_RENEWALS):
-            found = arm.refined(found)
     return arm.together({joint: found[joint] for joint in sorted(found)})
 
 
@@ -130,6 +130,8 @@ class ArmSearch:
             found: Joints that were searched, which keep their fits.
         """
         open_ones = [a for a in self.every if a.joint in self.declared and a.joint not in found]
+        if not open_ones:
+            return self
         begun = [a.with_estimate(self.declared[a.joint].theta) for a in open_ones]
         tried = self._with_loads(begun, found)
         fits = dict(zip([a.joint for a in tried], _fitted(self.session, tried), strict=True))
@@ -148,7 +150,7 @@ class ArmSearch:
         out = dict(found)
         for alone in self._with_loads(joints, found):
             own, d = session_of_joint(self.session, alone), found[alone.joint]
-            fit = refitted(own, d.after.machine, None)
+            fit = refitted(own, own.machine, None)
             if _squares(fit) < _squares(d.after):
                 out[alone.joint] = replace(d, after=fit)
         return out
