@@ -50,21 +50,21 @@ class OwnValues:
         An unknown with a value in each log has that of this log; if it is none of them, their mean.
         """
         values, others = dict(self.plant), {}
-        free: list[Free] = []
-        for f in machine.parameters.free:
+        kept: list[int] = []
+        for k, f in enumerate(machine.parameters.free):
             place = (f.path, f.index)
             if place in self.plant or (f.path[0] == CONTROLLER and f.path[1] in self.controller):
                 continue
             if f.log is None:
-                free.append(f)
+                kept.append(k)
             elif f.log == self.log:
                 values[place] = f.guess
-                free.append(f)
+                kept.append(k)
             else:
                 others.setdefault(place, []).append(f.guess)
         values = {place: float(np.mean(many)) for place, many in others.items()} | values
         controller = self._controller(machine.controller)
-        if not values and controller is machine.controller and len(free) == len(machine.parameters.free):
+        if not values and controller is machine.controller and len(kept) == len(machine.parameters.free):
             return machine
         places, numbers = tuple(values), np.array(list(values.values()))
         plant = scatter(places, machine.plant, numbers)
@@ -72,7 +72,7 @@ class OwnValues:
         return replace(
             machine,
             plant=plant,
-            parameters=replace(machine.parameters, free=tuple(free)),
+            parameters=machine.parameters.chosen(kept),
             controller=controller,
         )
 

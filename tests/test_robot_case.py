@@ -14,6 +14,7 @@ from jaxid.commands.discover import discover
 from jaxid.commands.init import init
 from jaxid.commands.robot_case import RobotCase, implied_case, let_go
 from jaxid.errors import InputError
+from jaxid.results.verdict.robot_file import contradicted_file
 from jaxid.session import open_session
 from tests.export.test_replayed import SERVOS, TRUE, logged, text
 from tests.support.cli_setup import run
@@ -59,6 +60,29 @@ def test_python_takes_a_robots_file_for_a_case_too(folder, of):
     case = implied_case(folder / "robot.xml", [str(folder / "log.csv")], search=of is jaxid.discover)
     made = RobotCase.of(str(folder / "robot.xml"), [str(folder / "log.csv")], search=of is jaxid.discover)
     assert case == made.tables
+
+
+def test_values_of_the_file_that_the_log_contradicts_are_listed(folder):
+    """The log is of a robot with other friction; against its own file it contradicts nothing."""
+    found = jaxid.identify(folder / "robot.xml", folder / "log.csv", method="inverse_dynamics")
+    [line] = [f for f in found.judgement.findings if "robot.xml" in f]
+    assert "values are not those of robot.xml: " in line
+    p = found.parameters
+    for name in ("coulomb_friction[1].level", "coulomb_friction[2].level"):
+        off = abs(p[name].value - p[name].guess) > max(3 * p[name].std, 0.01 * p[name].value)
+        assert off == (f"{name} = " in line), name
+        assert f"({p[name].guess:g} in the file)" in line
+    # A value of the case itself is none of the file's.
+    tables = implied_case(folder / "robot.xml", folder / "log.csv")
+    tables["plant"]["mjcf"] = str(folder / "robot.xml")
+    tables["plant"]["unknown"] = ["base", "armature", "damping"]
+    tables["effects"] = [{"kind": "coulomb_friction", "level": {"guess": [3.0, 3.0]}}]
+    [line] = contradicted_file(open_session(tables, folder / "log.csv"), found.estimate)
+    assert "coulomb_friction[1].level = " not in line
+
+    (folder / "robot.xml").write_text(text(**TRUE))
+    right = open_session(implied_case(folder / "robot.xml", folder / "log.csv"), folder / "log.csv")
+    assert contradicted_file(right, found.estimate) == []
 
 
 def test_joints_that_the_log_lacks_are_held(folder):

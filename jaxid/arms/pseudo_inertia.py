@@ -69,6 +69,7 @@ def _rows_moved(axes: Float[Array, "3 3"], origin: Float[Array, " 3"]) -> Float[
     return ten_parameters(place @ pseudo_inertia(jnp.eye(10)) @ place.T)
 
 
+@jax.jit
 def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:
     """Map a body to coordinates in which every body of positive density, and nothing else, is a point.
 
@@ -102,6 +103,7 @@ def log_cholesky(ten: Float[Array, " 10"]) -> Float[Array, " 10"]:
     )
 
 
+@jax.jit
 def of_log_cholesky(x: Float[Array, " 10"]) -> Float[Array, " 10"]:
     """Invert `log_cholesky`."""
     zero = jnp.zeros(())

@@ -29,18 +29,13 @@ from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.discovery.together import LEAST_AT_ONCE, add_together
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
-from jaxid.estimators import (
-    need_force,
-    need_known_controller,
-    need_known_reference,
-    one_log_for_bodies,
-)
+from jaxid.estimators import need_force, need_known_controller, need_known_reference
 from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.common.consistency import need_bodies, with_links
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import inverse_dynamics, inverse_dynamics_steps
+from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
 from jaxid.estimators.several.parts import parts_of
 from jaxid.gap import Gap, force_gap, gaps, noise_floor
@@ -50,7 +45,7 @@ from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
 from jaxid.numerics.coloured_noise import NoiseModel
-from jaxid.numerics.lanes import begin, run_alone
+from jaxid.numerics.lanes import Steps, begin, run_alone
 from jaxid.session import Logs, OpenedLog, Session, open_session
 from jaxid.session.holds import session_under_better_hold
 from jaxid.simulation.force_balance import ForceData
@@ -134,11 +129,9 @@ def explore(
         max_effects, refit, experiments, progress: Settings of `discover`.
 
     Raises:
-        InputError: If the reference has unknowns, or several logs are to keep links physically consistent.
+        InputError: If the reference has unknowns.
     """
     need_known_reference(session, "an error of it would be taken for an effect")
-    if session.more and session.case.identification.physically_consistent:
-        raise one_log_for_bodies(session.case.where)
     asked, chosen = max_effects, max_effects is None
     max_effects = _EFFECTS if max_effects is None else max_effects
     if session.machine.unforced(session.fit.log):
@@ -361,15 +354,19 @@ def _as_bodies_in_simulation(
         known = session.machine.parameters.guess
         at = start.machine.with_estimate([*known, *start.theta[len(known) :]])
         bodies = need_bodies(session.with_machine(at))
-        start = run_alone(with_links(inverse_dynamics_steps(bodies.machine, session.fit.data)))
+        start = run_alone(with_links(_of_force_steps(bodies), bodies))
     return in_simulation(session, start, refit)
 
 
 def _of_force(session: Session) -> Estimate:
     """Return the estimate by inverse dynamics of one log or of several."""
+    return run_alone(_of_force_steps(session))
+
+
+def _of_force_steps(session: Session) -> Steps[Estimate]:
     if session.more:
-        return run_alone(inverse_dynamics_of_several(session.machine, parts_of(session)))
-    return inverse_dynamics(session.machine, session.fit.data)
+        return inverse_dynamics_of_several(session.machine, parts_of(session))
+    return inverse_dynamics_steps(session.machine, session.fit.data)
 
 
 def where_of(search: Search, baseline: Step, session: Session) -> Where:

@@ -231,7 +231,7 @@ def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[
 def _piecewise(case: Case, method: str | None, options: Collection[str]) -> bool:
     """Check that a fit can take the stretches of a log with gaps as several logs."""
     demands = case.identification
-    single = demands.physically_consistent or demands.hessian or demands.profile or case.unknown_reference
+    single = demands.hessian or demands.profile or case.unknown_reference
     apart = {"hessian", "profile", "minimiser"} & set(options)
     return method in (None, *SEVERAL_LOGS) and not (single or apart or case.fits_within_prior(method))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxid.estimators.choice import choose_method
-from jaxid.estimators.common.consistency import links_of
+from jaxid.estimators.common.consistency import linked
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import output_error, output_error_steps
 from jaxid.estimators.prediction_error import prediction_error, prediction_error_steps
@@ -36,8 +36,8 @@ def in_simulation(session: Session, start: Estimate, refit: bool) -> tuple[Estim
         The estimate, and its gap on each log.
     """
     estimate = refit_of(session.with_machine(start.machine), start) if refit else start
-    if "links" in start.details:
-        estimate = replace(estimate, details={**estimate.details, "links": links_of(estimate.machine.plant)})
+    if start.machine.parameters.bodies:
+        estimate = linked(estimate, session)
     return estimate, gaps(estimate.machine, session.runs)
 
 
@@ -47,9 +47,6 @@ def refit_of(session: Session, start: Estimate) -> Estimate:
     if session.more:
         return start if blind else _refit_together(session, start)
     method = "" if blind else choose_method(session).method
-    if method == "prediction_error" and start.machine.parameters.bodies:
-        note = "not refitted: prediction_error does not keep links physically consistent"
-        return replace(start, notes=(*start.notes, note))
     if method == "prediction_error":
         return _refit_innovations(session, start)
     if method == "inverse_dynamics" and session.machine.controller is None:

@@ -235,8 +235,7 @@ def _start(session: Session) -> Steps[np.ndarray | None]:
         return None
     first = yield from METHODS[method](session)
     elsewhere = [in_loop(path) for path, _ in parameters.places]
-    within = np.isin(np.arange(len(first.theta)), [k for body in parameters.bodies for k in body.places])
-    usable = first.converged and np.all(first.identifiable | elsewhere | within)
+    usable = first.converged and np.all(first.identifiable | elsewhere | parameters.in_bodies)
     lower, upper = parameters.bounds
     inside = np.all((first.theta >= lower) & (first.theta <= upper))
     return first.theta if usable and inside else None
@@ -429,7 +428,8 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
     from jaxid.estimators.common.consistency import need_bodies, with_links
 
     need_consistent(method, session.case)
-    return with_links(steps(need_bodies(session), **options))
+    session = need_bodies(session)
+    return with_links(steps(session, **options), session)
 
 
 def need_likelihood(method: str, case: Case) -> None:
@@ -469,18 +469,6 @@ def need_one_log(session: Session, method: str) -> None:
     if method not in SEVERAL_LOGS:
         what = f"{method} fits one log, and there are {len(session.fits)}"
         raise InputError(what, where=where, hint=f"take one of {several}, or name one log")
-    if session.case.identification.physically_consistent:
-        raise one_log_for_bodies(where)
-
-
-def one_log_for_bodies(where: str) -> InputError:
-    """Return the error that links can be kept physically consistent with one log only.
-
-    Args:
-        where: Where the case is.
-    """
-    what = "physically_consistent goes with one log"
-    return InputError(what, where=f"{where}, [identification]", hint="leave it out, or name one log")
 
 
 def need_no_profile(session: Session, asked: Sequence[str]) -> None:

@@ -324,9 +324,9 @@ class OutputFit:
             def evaluate(x: np.ndarray) -> Steps[Model]:
                 theta, starts = scale.outward(x)
                 logs = yield from self._rows(theta, starts, signals, weights)
-                return summed(logs, scale.slope(theta))
+                return summed(logs, lambda columns: scale.inner(columns, theta))
 
-            options = {"tolerance": (self.tolerance, 0.0), "max_steps": _MOST, "active": active}
+            options = {**scale.limits(self.tolerance, _MOST), "active": active}
             return (yield from descent_steps(evaluate, x, scale.bounds, **options))
 
         x = scale.inward(theta, starts)

@@ -38,7 +38,7 @@ def profile_steps(
     profiles, notes = {}, []
     theta, cost, count, (lower, upper), active = found
     white = 2 * cost / max(count - active.sum(), 1)
-    bound = np.isin(np.arange(theta.size), [k for b in machine.parameters.bodies for k in b.places])
+    bound = machine.parameters.in_bodies
     for name in asked:
         k = machine.parameters.names.index(name)
         if not precision.identifiable[k] or precision.equivalent_variance is None:

@@ -283,8 +283,8 @@ def _asked(machine: Machine) -> int:
     if not unknown.bodies:
         return len(unknown.free)
     sums = base_parameters(machine.plant).chosen_names
-    within = {k for body in unknown.bodies for k in body.places}
-    return sum(k not in within or f.name in sums for k, f in enumerate(unknown.free))
+    each = zip(unknown.free, unknown.in_bodies, strict=True)
+    return sum(not within or f.parameter in sums for f, within in each)
 
 
 def _noise_shares(data: Prepared) -> Float[np.ndarray, " n"]:

@@ -26,7 +26,7 @@ from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
-from jaxid.model.unknowns import CONTROLLER, Parameters
+from jaxid.model.unknowns import CONTROLLER
 from jaxid.numerics.lanes import Steps
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.noisy_loop import ReadingNoise, estimated_noise
@@ -163,9 +163,10 @@ def base_of(machine: Machine, group: tuple[int, ...]) -> int:
 
 def without(machine: Machine, base: int) -> Machine:
     """Return the machine with one unknown known at its guess."""
-    free = machine.parameters.free
-    parameters = Parameters((*free[:base], *free[base + 1 :]), machine.parameters.bodies)
-    return machine.with_plant(machine.plant, parameters)
+    unknown = machine.parameters
+    return machine.with_plant(
+        machine.plant, unknown.chosen([k for k in range(len(unknown.free)) if k != base])
+    )
 
 
 def with_free_scale(estimate: Estimate, machine: Machine, group: tuple[int, ...], base: int) -> Estimate:

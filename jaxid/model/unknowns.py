@@ -149,6 +149,21 @@ class Parameters:
         """Return these unknowns and more behind them."""
         return Parameters((*self.free, *more), self.bodies)
 
+    def chosen(self, kept: Sequence[int]) -> Parameters:
+        """Return some of the unknowns by their indices, with the bodies that are among them as a whole."""
+        new = {old: k for k, old in enumerate(kept)}
+        bodies = tuple(
+            replace(body, places=tuple(new[k] for k in body.places))
+            for body in self.bodies
+            if all(k in new for k in body.places)
+        )
+        return Parameters(tuple(self.free[k] for k in kept), bodies)
+
+    @property
+    def in_bodies(self) -> Bool[np.ndarray, " p"]:
+        """Mask of the unknowns that belong to a body."""
+        return np.isin(np.arange(len(self.free)), [k for body in self.bodies for k in body.places])
+
 
 def in_loop(path: tuple[str | int, ...]) -> bool:
     """Check that an unknown is one of the reference or of the controller."""

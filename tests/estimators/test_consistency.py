@@ -10,31 +10,30 @@ import pytest
 
 import jaxid
 from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_inertia
-from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.cli import main
 from jaxid.estimators import _start, need_consistent
 from jaxid.estimators.common.consistency import need_bodies
 from jaxid.estimators.common.interior import inner_start
 from jaxid.estimators.common.levenberg_marquardt import eliminated
-from jaxid.logs.log import Log
 from jaxid.numerics.lanes import run_alone
+from tests.support.wrist import (
+    NOISE,
+    TRUE,
+    case,
+    eigenvalues,
+    eigenvalues_of,
+    left,
+    loop_log,
+    looped,
+    motion,
+    one_link,
+    swing,
+    wrist_log,
+)
 from truth.arm import oracle as arm_oracle
-from truth.arm import stepper as arm_stepper
 
 RNG = np.random.default_rng(4)
-GRAVITY = np.array([0.0, 0.0, -9.81])
-# A wrist, whose last link is light and short.
-WRIST = [
-    ("revolute", 0.0, 0.0, 0.0, 0.0),
-    ("revolute", np.pi / 2, 0.0, 0.3, 0.0),
-    ("revolute", -np.pi / 2, 0.2, 0.0, 0.0),
-]
-SHORT = np.array([1.0, 0.3, 0.3, 0.3, *[0.09] * 6])
-SIZES = np.array([np.ones(10), 0.5 * np.ones(10), 0.02 * SHORT])
-TRUE = SIZES * arm_oracle.bodies(3, np.random.default_rng(1))
-NOISE = 2.0
-RATE, SECONDS = 100.0, 12.0
 
 
 def test_pseudo_inertia_is_the_sum_over_the_body():
@@ -108,43 +107,9 @@ def test_a_step_that_rounding_leads_out_of_the_set_is_refused():
         assert np.all(np.isfinite(log_cholesky(found))), seed
 
 
-def motion(seed: int, rate: float = RATE) -> tuple[np.ndarray, ...]:
-    """Sums of sines, and their derivatives."""
-    rng, t = np.random.default_rng(seed), np.arange(0, SECONDS, 1 / rate)[:, None, None]
-    ranges = ((0.1, 1.0), (0.0, 6.0), (0.1, 0.5))
-    hz, phase, size = (rng.uniform(*r, (3, 5)) for r in ranges)
-    w = 2 * np.pi * hz
-    angle = w * t + phase
-    parts = (size * np.sin(angle), size * w * np.cos(angle), -size * w**2 * np.sin(angle))
-    return (t.ravel(), *(x.sum(axis=-1) for x in parts))
-
-
-def torque(seed: int) -> tuple[np.ndarray, ...]:
-    t, q, qd, qdd = motion(seed)
-    tau = [arm_oracle.inverse_dynamics(WRIST, TRUE, *x, GRAVITY) for x in zip(q, qd, qdd, strict=True)]
-    return t, q, qd, qdd, np.array(tau)
-
-
 @pytest.fixture(scope="module")
 def log():
-    t, q, _, _, tau = torque(0)
-    noise = NOISE * np.random.default_rng(9).standard_normal(tau.shape)
-    return Log(time=t, position=q, force=tau + noise, source="wrist")
-
-
-def case(consistent: bool) -> str:
-    """Every link starts as a ball of 1 kg off its joint."""
-    numbers = "{ guess = %s }"
-    ball = ("1.0", ["0.1", "0.05", "0.1"], ["0.03", "-0.005", "-0.01", "0.03", "-0.005", "0.03"])
-    listed = lambda values: "[" + ", ".join(numbers % v for v in values) + "]"
-    links = "".join(
-        f'[[plant.links]]\njoint = "revolute"\nalpha = {alpha!r}\na = {a}\nd = {d}\n'
-        f"mass = {numbers % ball[0]}\nfirst_moment = {listed(ball[1])}\ninertia = {listed(ball[2])}\n"
-        for _, alpha, a, d, _ in WRIST
-    )
-    columns = 'position = ["q1", "q2", "q3"]\nforce = ["u1", "u2", "u3"]\n'
-    asked = "[identification]\nphysically_consistent = true\n" if consistent else ""
-    return f'[plant]\nkind = "serial_arm"\n{links}{asked}[log]\ntime = "t"\n{columns}'
+    return wrist_log(0, NOISE, 9)
 
 
 def fitted(folder, log, consistent, method="inverse_dynamics"):
@@ -156,20 +121,6 @@ def fitted(folder, log, consistent, method="inverse_dynamics"):
 def fits(tmp_path_factory, log):
     folder = tmp_path_factory.mktemp("fits")
     return {consistent: fitted(folder, log, consistent) for consistent in (False, True)}
-
-
-def eigenvalues(found) -> np.ndarray:
-    plant = found.estimate.machine.plant
-    ten = np.stack([np.asarray(getattr(plant, name)) for name in arm_oracle.NAMES], axis=-1)
-    return np.linalg.eigvalsh(arm_oracle.pseudo_inertias(ten))
-
-
-def left(found) -> float:
-    """RMS of a noisy torque on another motion less the one that is predicted, over the noise."""
-    _, q, qd, qdd, tau = torque(9)
-    noise = NOISE * np.random.default_rng(5).standard_normal(tau.shape)
-    told = jax.vmap(found.estimate.machine.plant.inertial)(*(jnp.asarray(x) for x in (q, qd, qdd)))
-    return float(np.sqrt(np.mean((tau + noise - told) ** 2)) / NOISE)
 
 
 @pytest.mark.slow
@@ -223,19 +174,6 @@ def test_a_recursion_ends_at_real_bodies(log, tmp_path):
     assert eigenvalues(plain).min() < -0.001
 
 
-def test_several_logs_with_real_bodies_are_refused_by_a_search_too(log, tmp_path, capsys):
-    rows = np.column_stack([log.time, log.position, log.force])
-    for name in ("one", "two"):
-        columns = "t,q1,q2,q3,u1,u2,u3"
-        np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header=columns, comments="")
-    fits = "".join(f'[[fit]]\nname = "{name}"\nlog = "{name}.csv"\n' for name in ("one", "two"))
-    (tmp_path / "case.toml").write_text(case(True) + fits)
-    assert main(["discover", str(tmp_path / "case.toml"), "-o", str(tmp_path / "out")]) == 2
-    [error] = capsys.readouterr().err.strip().splitlines()
-    assert "physically_consistent goes with one log" in error
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.slow
 def test_a_search_ends_at_real_bodies(log, tmp_path):
     """A friction of the second joint is hidden; links that fit best without the demand are of no body."""
@@ -248,13 +186,7 @@ def test_a_search_ends_at_real_bodies(log, tmp_path):
         assert [e.label for e in found[consistent].effects] == ["viscous_friction[2]"]
         p = found[consistent].parameters["viscous_friction[2].coefficient"]
         assert abs(p.value - 5.0) < 4 * p.std < 2.0
-    plants = {k: f.after.machine.plant for k, f in found.items()}
-    least = {
-        k: np.linalg.eigvalsh(
-            arm_oracle.pseudo_inertias(np.stack([getattr(p, name) for name in arm_oracle.NAMES], axis=-1))
-        ).min()
-        for k, p in plants.items()
-    }
+    least = {k: eigenvalues_of(f.after.machine.plant).min() for k, f in found.items()}
     assert least[False] < -0.001
     assert least[True] > 0
 
@@ -263,21 +195,9 @@ def test_a_search_ends_at_real_bodies(log, tmp_path):
 @pytest.mark.parametrize("method", ["instrumental_variable", "didim"])
 def test_methods_that_simulate_the_motion_keep_links_too(tmp_path, method):
     """From a loop of other physics; without, the noise of the torque asks for what no body can be."""
-    rate, kp, kd = 200.0, [600.0, 150.0, 3.0], [30.0, 8.0, 0.15]
-    t, q, _, _ = motion(0, rate)
-    reference = q * np.minimum(1.0, t)[:, None] ** 3
-    law = f'[controller]\nkind = "pd"\nkp = {kp}\nkd = {kd}\nperiod = {1 / rate}\n'
-    text = case(True).replace("[log]\n", '[log]\nreference = ["r1", "r2", "r3"]\n') + law
-    (tmp_path / "case.toml").write_text(text)
-    (tmp_path / "plain.toml").write_text(text.replace("consistent = true", "consistent = false"))
-    geometry = build_machine(load_case(tmp_path / "case.toml"), period=1 / rate).plant.geometry
-    axes, origins = (np.asarray(x) for x in geometry.frames(np.zeros(3)))
-    arm = arm_stepper.Arm(axes, origins, TRUE, np.zeros(3), np.zeros(3))
-    run = arm_stepper.followed(arm, reference, rate=rate, kp=np.array(kp), kd=np.array(kd))
-    rng = np.random.default_rng(3)
-    position = run["q"] + 1e-5 * rng.standard_normal(q.shape)
-    force = run["u"] + NOISE * rng.standard_normal(q.shape)
-    log = Log(time=t, position=position, force=force, reference=reference, source="loop")
+    (tmp_path / "case.toml").write_text(looped(True))
+    (tmp_path / "plain.toml").write_text(looped(False))
+    log = loop_log()
     cases = (tmp_path / f"{name}.toml" for name in ("case", "plain"))
     kept, plain = (jaxid.identify(path, log, method=method) for path in cases)
     assert kept.estimate.converged
@@ -290,25 +210,8 @@ def test_methods_that_simulate_the_motion_keep_links_too(tmp_path, method):
 def test_output_error_keeps_links_too(tmp_path):
     """One link that swings; its moment about the joint, and its first moments, are told."""
     true = TRUE[0]
-    t = np.arange(0, 4, 1 / RATE)
-    u = 3.0 * np.sin(2 * np.pi * 0.6 * t) + 2.0 * np.sin(2 * np.pi * 1.4 * t)
-    q, v, positions = 0.0, 0.0, []
-    # The joint lies level: weight is g (-mx cos q + my sin q) about it.
-    push = lambda q, u: (u - 9.81 * (true[1] * np.cos(q) - true[2] * np.sin(q))) / true[9]
-    for now in u:
-        positions.append(q)
-        for _ in range(20):
-            half = v + 0.5 / (20 * RATE) * push(q, now)
-            q += half / (20 * RATE)
-            v = half + 0.5 / (20 * RATE) * push(q, now)
-    noisy = np.array(positions) + 1e-4 * np.random.default_rng(0).standard_normal(len(t))
-    log = Log(time=t, position=noisy, force=u, source="pendulum")
-    text = case(True)
-    one = text[: text.index("[[plant.links]]", text.index("[[plant.links]]") + 1)]
-    tail = text[text.index("[identification]") :].replace(', "q2", "q3"', "").replace(', "u2", "u3"', "")
-    level = one.replace('"serial_arm"', '"serial_arm"\ngravity_vector = [0.0, -9.81, 0.0]')
-    (tmp_path / "case.toml").write_text(level + tail)
-    found = jaxid.identify(tmp_path / "case.toml", log)
+    (tmp_path / "case.toml").write_text(one_link())
+    found = jaxid.identify(tmp_path / "case.toml", swing(0))
     assert found.estimate.method == "output_error"
     assert found.estimate.converged
     assert eigenvalues(found).min() > 0

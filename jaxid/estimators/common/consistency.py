@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from jaxid.arms.pseudo_inertia import log_cholesky, pseudo_inertia
 from jaxid.errors import InputError
 from jaxid.estimators.estimate import Estimate
+from jaxid.model.by_name import Place
 from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Body, Free
 from jaxid.names import TEN
@@ -29,19 +30,51 @@ def need_bodies(session: Session) -> Session:
     Other machines are returned unchanged; their inertias are positive anyway.
 
     Raises:
-        InputError: If a link is known in part, bounded by min or max, or its guess is no body.
+        InputError: If a link is known in part, bounded by min or max, or its guess is no body; also if a log
+            has some of its ten parameters for itself and shares others.
     """
     machine, where = session.machine, session.case.where
     if not machine.plant.linked:
         return session
     unknown, bodies = machine.parameters.free, []
     for link in range(len(bodies_of(machine.plant))):
-        indices = {f.path[0]: k for k, f in enumerate(unknown) if f.path[0] in TEN and f.index == link}
-        if indices:
-            bodies.append(_body(link, indices, unknown, f"{where}, link {link + 1}"))
+        mine = {k: f for k, f in enumerate(unknown) if f.path[0] in TEN and f.index == link}
+        place = f"{where}, link {link + 1}"
+        if mine:
+            _need_whole(session, link, [f.log for f in mine.values()], place)
+        # A link whose parameters differ between logs is another body in each.
+        for log in dict.fromkeys(f.log for f in mine.values()):
+            indices = {str(f.path[0]): k for k, f in mine.items() if f.log == log}
+            bodies.append(_body(link, indices, unknown, place))
     return session.with_machine(
         machine.with_plant(machine.plant, replace(machine.parameters, bodies=tuple(bodies)))
     )
+
+
+def _need_whole(session: Session, link: int, logs: Sequence[str | None], where: str) -> None:
+    """Refuse an unknown link of which a log has a part for itself, known or not.
+
+    Args:
+        session: Case and logs.
+        link: Index of the link.
+        logs: Log of each of its unknown parameters; None: that of all logs.
+        where: Place of the link in the case.
+
+    Raises:
+        InputError: If a log does.
+    """
+    names = [run.name for run in session.fits if run.own and 0 < _known(run.own.plant, link) < len(TEN)]
+    if None in logs and any(logs):
+        names = [log for log in logs if log is not None]
+    if names:
+        what = f"{names[0]} has some of the link's ten parameters for itself and shares the others"
+        hint = "set all ten, or name all ten in per_log: physically_consistent asks for whole bodies"
+        raise InputError(what, where=where, hint=hint)
+
+
+def _known(values: Mapping[Place, float], link: int) -> int:
+    """Return how many of a link's ten parameters are among some values by their places."""
+    return sum(((name,), link) in values for name in TEN)
 
 
 def _body(link: int, indices: dict[str, int], unknown: Sequence[Free], where: str) -> Body:
@@ -77,17 +110,31 @@ def _body(link: int, indices: dict[str, int], unknown: Sequence[Free], where: st
     return Body(places, tuple(lower.tolist()), tuple(upper.tolist()))
 
 
-def with_links(steps: Steps[Estimate]) -> Steps[Estimate]:
-    """Run a fit and add the parameters of each link to its estimate, identifiable or not."""
-    estimate = yield from steps
-    if not estimate.machine.plant.linked:
+def with_links(steps: Steps[Estimate], session: Session) -> Steps[Estimate]:
+    """Run a fit and add the parameters of each link to its estimate, see `linked`."""
+    return linked((yield from steps), session)
+
+
+def linked(estimate: Estimate, session: Session) -> Estimate:
+    """Return an estimate with the parameters of each link, identifiable or not.
+
+    If the parameters of a link differ between logs, they stand among the results of each.
+    """
+    machine = estimate.machine
+    if not machine.plant.linked:
         return estimate
-    note = "links are physically consistent; standard deviations are those of the log alone"
-    return replace(
-        estimate,
-        notes=(*estimate.notes, note),
-        details={**estimate.details, "links": links_of(estimate.machine.plant)},
-    )
+    alone = "the log" if not session.more else "the logs"
+    note = f"links are physically consistent; standard deviations are those of {alone} alone"
+    details = dict(estimate.details)
+    unknown = machine.parameters
+    if any(f.log for f, linked in zip(unknown.free, unknown.in_bodies, strict=True) if linked):
+        fits = details.get("fits", {})
+        links = {run.name: {"links": links_of(run.machine(machine).plant)} for run in session.fits}
+        details["fits"] = {name: {**fits.get(name, {}), **entry} for name, entry in links.items()}
+    else:
+        details["links"] = links_of(machine.plant)
+    notes = estimate.notes if note in estimate.notes else (*estimate.notes, note)
+    return replace(estimate, notes=notes, details=details)
 
 
 def links_of(plant: Plant) -> list[dict[str, object]]:

@@ -31,8 +31,8 @@ _FLAT = 1e-8
 _WHOLE = 1e-2
 # Fits of bodies may take more evaluations and have a looser tolerance: their unidentifiable coordinates move
 # far along curves.
-_BODY_STEPS = 500
-_BODY_TOLERANCE = 1e-9
+BODY_STEPS = 500
+BODY_TOLERANCE = 1e-9
 # It has also converged if the cost exceeds a known lower bound by no more than this part of itself, divided
 # by the number of residuals: also a hundredth of a standard deviation. If the steps have run out, the fall
 # that the whole step predicts must be as small.
@@ -111,6 +111,14 @@ class Transform(eqx.Module):
             )
         return out
 
+    def inner(self, jacobian: Float[Array, "rows p"], theta: Float[Array, " p"]) -> Array:
+        """Convert a Jacobian by the physical values theta to one by the solver's values."""
+        out = jacobian * self.slope(theta)
+        for places in map(np.array, self.bodies):
+            turned = jacobian[:, places] @ _slope_of_body(theta[places])
+            out = jnp.asarray(out).at[:, places].set(turned)
+        return out
+
     def _with_bodies(self, out: Array, f: Callable[[Array], Array], values: Array) -> Array:
         for places in map(np.array, self.bodies):
             out = jnp.asarray(out).at[places].set(f(values[places]))
@@ -119,6 +127,12 @@ class Transform(eqx.Module):
     def slope(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
         """Return the derivative of physical by solver values, (p,), for unknowns that belong to no body."""
         return library(self.log, theta).where(self.log, theta, 1.0)
+
+
+@jax.jit
+def _slope_of_body(ten: Float[Array, " 10"]) -> Float[Array, "10 10"]:
+    """Return the derivative of a body's parameters by its `log_cholesky`."""
+    return jax.jacfwd(of_log_cholesky)(log_cholesky(ten))
 
 
 class Minimum(eqx.Module):
@@ -266,8 +280,8 @@ def levenberg_marquardt(
         residual = lambda theta: columns @ theta + rest
         theta, floor = inner_start(columns, rest, theta, transform.bodies, eliminated)
     if transform.bodies:
-        tolerance = max(tolerance, _BODY_TOLERANCE)
-    max_steps = max_steps or (_BODY_STEPS if transform.bodies else 60)
+        tolerance = max(tolerance, BODY_TOLERANCE)
+    max_steps = max_steps or (BODY_STEPS if transform.bodies else 60)
 
     bounds = transform.bounds(jnp.asarray(lower), jnp.asarray(upper))
     x0 = jnp.clip(transform.inward(theta), *bounds)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.common.best_bodies import best_bodies
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared, prepare
 from jaxid.machine import Machine
@@ -130,17 +130,7 @@ def best_step(
     """
     if not parameters.bodies:
         return bounded_step(columns, e, theta, parameters.bounds)
-    # The triangular factor gives the same sum of squares with about as many rows as unknowns.
-    triangle = np.asarray(np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r"))
-    minimum = _best_bodies(triangle, Transform.of(parameters), parameters.guess, parameters.bounds)
-    return np.asarray(minimum.theta) - theta
-
-
-@kept_jit
-def _best_bodies(triangle: Array, transform: Transform, guess: Array, bounds: tuple[Array, Array]) -> Minimum:
-    linear = replace(transform, log=np.zeros(guess.size, bool), affine=True)
-    residual = lambda theta: triangle[:, :-1] @ theta + triangle[:, -1]
-    return levenberg_marquardt(residual, guess, linear, *bounds)
+    return best_bodies(parameters, columns, e, theta)[0] - theta
 
 
 def bounded_step(

@@ -10,6 +10,7 @@ import scipy.sparse
 
 from jaxid.estimators.algebraic.windows import kernels_of as algebraic_kernels
 from jaxid.estimators.algebraic.windows import windows_and_columns, windows_without_rest
+from jaxid.estimators.common.best_bodies import best_bodies
 from jaxid.estimators.common.shapes import phase_starts, shape_starts
 from jaxid.estimators.common.windowed import Kernels, row_covariance_steps, weights_of_rows
 from jaxid.estimators.estimate import Estimate
@@ -136,9 +137,11 @@ def least_squares_steps(
                 arguments = (*own.arguments, theta[part.index])
                 e, columns = yield SolveRequest(own.function, arguments)
                 logs.append(own.rows(part, e, columns, p, float(weight)))
-            return summed(logs, scale.slope(theta))
+            return summed(logs, lambda columns: scale.inner(columns, theta))
 
-        options = {"tolerance": (_TOLERANCE, 0.0), "max_steps": _MOST, "damping": damping}
+        if transform.affine:
+            return (yield from _bodies_steps(machine, scale, evaluate, x))
+        options = {**scale.limits(_TOLERANCE, _MOST), "damping": damping}
         return (yield from descent_steps(evaluate, x, scale.bounds, **options))
 
     first = start_weights([own.signal for own in equations], [int(own.counts.sum()) for own in equations])
@@ -155,6 +158,19 @@ def least_squares_steps(
         found, _ = yield from descended_steps(fit, found.x, weights)
     factors = [own.counts if own.factor is None else own.factor for own in equations]
     return _estimate(machine, method, parts, scale, found, factors)
+
+
+def _bodies_steps(
+    machine: Machine, scale: Scale, evaluate: Callable[[np.ndarray], Steps[Model]], x: np.ndarray
+) -> Steps[Descent]:
+    """Minimise over real bodies at once: the residual of every log is affine in the unknowns."""
+    at = yield from evaluate(x)
+    if not at.finite:
+        return Descent(x, at, False, 1)
+    jacobian, e, counts = stacked(at.content)
+    theta, converged = best_bodies(machine.parameters, jacobian[counts], e[counts], scale.outward(x)[0])
+    x = scale.inward(theta)
+    return Descent(x, (yield from evaluate(x)), converged, 2)
 
 
 def _estimate(

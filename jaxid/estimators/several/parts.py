@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.estimators.common.levenberg_marquardt import Transform
+from jaxid.estimators.common.levenberg_marquardt import BODY_STEPS, BODY_TOLERANCE, Transform
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -114,9 +114,18 @@ class Scale:
         p = self.lower.size
         return np.asarray(self.transform.outward(x[:p])), x[p:]
 
-    def slope(self, theta: np.ndarray) -> np.ndarray:
-        """Return the derivative of all physical values by those of the solver, (p + more,)."""
-        return np.concatenate([np.asarray(self.transform.slope(theta)), np.ones(self.more)])
+    def inner(self, columns: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        """Return derivatives by the physical values theta as those by the solver's, (rows, p + more)."""
+        if not self.transform.bodies:
+            return columns * np.concatenate([np.asarray(self.transform.slope(theta)), np.ones(self.more)])
+        of_unknowns = np.asarray(self.transform.inner(columns[:, : theta.size], theta))
+        return np.concatenate([of_unknowns, columns[:, theta.size :]], axis=1)
+
+    def limits(self, tolerance: float, most: int) -> dict[str, Any]:
+        """Return when a descent ends, as keyword arguments: bodies take more steps to a looser tolerance."""
+        if self.transform.bodies:
+            tolerance, most = max(tolerance, BODY_TOLERANCE), max(most, BODY_STEPS)
+        return {"tolerance": (tolerance, 0.0), "max_steps": most}
 
 
 def by_log(parts: Sequence[Part], entries: Sequence[dict[str, Any]]) -> dict[str, Any]:

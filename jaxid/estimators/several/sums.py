@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -10,19 +10,19 @@ from jaxid.estimators.several.descent import Model
 from jaxid.numerics.rows import Rows
 
 
-def summed(logs: list[Rows], slope: np.ndarray) -> Model:
+def summed(logs: list[Rows], inner: Callable[[np.ndarray], np.ndarray]) -> Model:
     """Return half the weighted sum of squares of some logs, and its model on the scale of the solver.
 
     Args:
         logs: Residuals and Jacobians by the physical values; both are zero at samples that do not count.
-        slope: Derivative of the physical values by those of the solver.
+        inner: Function that returns derivatives by the physical values, (rows, q), as those by the solver's.
     """
-    cost, q = 0.0, slope.size
+    cost, q = 0.0, logs[0].jacobian.shape[-1]
     gradient, normal = np.zeros(q), np.zeros((q, q))
     # A step may lead where a simulation diverges: its cost is no finite number, and it is refused.
     with np.errstate(invalid="ignore", over="ignore"):
         for log in logs:
-            e, columns = log.residual.ravel(), log.jacobian.reshape(-1, q) * slope
+            e, columns = log.residual.ravel(), inner(log.jacobian.reshape(-1, q))
             cost += 0.5 * log.weight * float(e @ e)
             gradient += log.weight * (columns.T @ e)
             normal += log.weight * (columns.T @ columns)

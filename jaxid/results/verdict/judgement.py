@@ -15,6 +15,7 @@ from jaxid.machine import Machine
 from jaxid.results.report.numbers import percent, plain, scaled_unit
 from jaxid.results.verdict.absurd import Remark, remarks_on, undetermined
 from jaxid.results.verdict.completeness import Residual, position_residuals, residuals_of
+from jaxid.results.verdict.robot_file import contradicted_file
 from jaxid.session import OpenedLog, Session
 
 # A force residual of this part of the measured force, or a distance of the simulated position of this part of
@@ -96,6 +97,7 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
             "Check first that the columns of position and force are the right ones, with sign, unit and gain."
         )
     findings += _completeness_words(session, residuals, complete, None if doubtful else search or "none")
+    findings += contradicted_file(session, estimate)
     others = [r for r in remarks if r not in (*impossible, *contrary)]
     findings += _remark_words(others)
     drifted = _drifted(session, gaps)
