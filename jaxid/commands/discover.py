@@ -132,58 +132,74 @@ def explore(
         InputError: If the reference has unknowns.
     """
     need_known_reference(session, "an error of it would be taken for an effect")
-    asked, chosen = max_effects, max_effects is None
-    max_effects = _EFFECTS if max_effects is None else max_effects
+    most = _EFFECTS if max_effects is None else max_effects
     if session.machine.unforced(session.fit.log):
         if stands_apart(session.machine, parts_of(session)):
-            return explore_by_joint(session, max_effects=max_effects, progress=progress)
+            return explore_by_joint(session, max_effects=most, progress=progress)
         _need_one_servo(session)
-        return explore_unforced(session, max_effects=max_effects, progress=progress)
+        return explore_unforced(session, max_effects=most, progress=progress)
+
     need_force(session, "a search of a log with a force")
     _need_no_command_effects(session)
     need_known_controller(session, "a search in forces does not simulate the loop")
     if session.fit.log.steady is not None:
         from jaxid.discovery.steady import explore_steady
 
-        return explore_steady(session, max_effects=max_effects, progress=progress)
+        return explore_steady(session, max_effects=most, progress=progress)
     if session.case.fits_within_prior("discover"):
         session.need_one_log("discover within a prior")
-        return explore_within(session, max_effects=max_effects, progress=progress)
+        return explore_within(session, max_effects=most, progress=progress)
+
+    if max_effects is None:
+        most = max(most, _BY_JOINT * session.fit.data.q.shape[1])
+    return _explore_forces(session, most, refit=refit, experiments=experiments, progress=progress)
+
+
+def _explore_forces(
+    session: Session,
+    most: int,
+    *,
+    refit: bool,
+    experiments: bool | None,
+    progress: Callable[[str], None],
+) -> Discovery:
+    """Search in the force domain, refit in simulation, and search at rest what that leaves.
+
+    Args:
+        session: Case and logs, with forces.
+        most: Largest number of effects to add.
+        refit, experiments, progress: Settings of `discover`.
+    """
     progress("fitting the declared model")
     baseline, search = start_search(session, progress)
     # Compiling the refits takes as long as the search, and neither needs the other.
     declared = begin(_as_bodies_in_simulation, session, baseline, refit)
-    if chosen:
-        max_effects = max(max_effects, _BY_JOINT * session.fit.data.q.shape[1])
-    steps = search.run(
-        max_effects, lambda search, first: add_together(search, first, max_effects, least=LEAST_AT_ONCE)
-    )
-    steps = add_together(search, steps, max_effects)
+    steps = _searched(search, most)
     if (other := _under_better_hold(session, search, baseline.machine)) is not None:
         declared.cancel()
         progress("searching under the other hold of the force")
-        return explore(other, max_effects=asked, refit=refit, experiments=experiments, progress=progress)
-    likely = search.model
-    refitted = None
+        return _explore_forces(other, most, refit=refit, experiments=experiments, progress=progress)
+
+    likely, ahead = search.model, None
     if likely.added:
         machine, _ = final_machine(baseline.machine, search, {}, steps)
-        refitted = begin(_with_effects, session, machine, refit)
+        ahead = begin(_with_effects, session, machine, refit)
     where = where_of(search, steps[0], session)
-    final, effects = _simulable(session, search, baseline.machine, steps, max_effects, progress)
+    final, effects = _simulable(session, search, baseline.machine, steps, most, progress)
     verdict = _verdict(effects, where, steps, search)
 
     progress("refitting in simulation" if refit else "simulating")
     before, old = declared.result()
     after, new = before, old
-    if refitted is not None and search.model is not likely:
-        refitted.cancel()
-        refitted = None
+    if ahead is not None and search.model is not likely:
+        ahead.cancel()
+        ahead = None
     if effects:
-        after, new = refitted.result() if refitted else _with_effects(session, final, refit)
+        after, new = ahead.result() if ahead else _with_effects(session, final, refit)
     separating = _experiments(session, search, effects, experiments, progress)
 
     found = Found(after, effects, where, _UNEXPLAINED if verdict == "unexplained" else "")
-    found = named_at_rest(found, session, search, steps, max_effects, progress)
+    found = named_at_rest(found, session, search, steps, most, progress)
     if found.estimate is not after:
         progress("simulating")
         verdict, new = "found", gaps(found.estimate.machine, session.runs)
@@ -201,6 +217,12 @@ def explore(
         proposals=separating,
         unseen=found.unseen,
     )
+
+
+def _searched(search: Search, most: int) -> list[Step]:
+    """Run a search, with the laws of all joints at once where many are missing, and return its steps."""
+    steps = search.run(most, lambda search, first: add_together(search, first, most, least=LEAST_AT_ONCE))
+    return add_together(search, steps, most)
 
 
 def _under_better_hold(session: Session, search: Search, machine: Machine) -> Session | None:

@@ -71,6 +71,9 @@ class Acceptance:
         force = self.data.at_kept(self.data.force - np.mean(self.data.force, axis=0))
         rows = len(self.samples.moving) / len(force)
         self._numerics = rows * np.sum((NUMERICS * force) ** 2, axis=0)
+        # What acts on a joint without a drive comes from the driven ones.
+        self._numerics_of_joints = np.full(self.samples.moving.shape[1], np.max(self._numerics))
+        self._numerics_of_joints[list(machine.plant.driven(machine.plant.joints))] = self._numerics
         self._noise = self.samples.moving.sum(axis=0) * np.square(self.floor)
 
     @property
@@ -120,7 +123,7 @@ class Acceptance:
 
         The friction of a wrist is little beside what the model still lacks at the shoulder.
         """
-        sums = (self._sums(old), self._sums(new), self._noise, self._numerics)
+        sums = (self._sums(old), self._sums(new), self._noise, self._numerics_of_joints)
         by_joint = (self._part(*map(float, joint)) for joint in zip(*sums, strict=True))
         return max(self.closed(old, new), *by_joint)
 
