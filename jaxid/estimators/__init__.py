@@ -186,20 +186,25 @@ def _prediction_error(
     need_no_hessian(session, precision["hessian"])
     if session.more:
         first = yield from _inverse_dynamics(session)
-        start = first.theta if first.all_identified else None
+        start = _whole(first, machine)
         return (yield from prediction_error_steps(machine, parts_of(session), start=start, numerics=numerics))
     first = yield from inverse_dynamics_steps(machine, run.data)
     return (
         yield from prediction_error_steps(
             machine,
             run.log,
-            start=first.theta if first.all_identified else None,
+            start=_whole(first, machine),
             numerics=numerics,
             rest_velocity=np.asarray(run.data.recipe.rest_velocity),
             command_noise=force_noise(machine, run.data),
             **precision,
         )
     )
+
+
+def _whole(first: Estimate, machine: Machine) -> np.ndarray | None:
+    """Return the values of a fit that has all of them, identified or those of a real body; else None."""
+    return first.theta if np.all(first.identifiable | machine.parameters.in_bodies) else None
 
 
 def _beside_the_guesses(session: Session) -> Steps[list[np.ndarray]]:
@@ -336,7 +341,8 @@ _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 # Methods that simulate, and accept options of the simulation.
 SIMULATING = ("output_error", "within_prior", "instrumental_variable", "didim")
 
-# Methods that can keep links physically consistent: each of them minimises, at least within a step.
+# Methods that can keep links physically consistent: each of them minimises, at least within a step, or
+# ends at the nearest real bodies.
 CONSISTENT = (
     "inverse_dynamics",
     "power",
@@ -344,6 +350,8 @@ CONSISTENT = (
     "instrumental_variable",
     "didim",
     "output_error",
+    "prediction_error",
+    "within_prior",
     "recursive",
 )
 
@@ -503,8 +511,6 @@ def need_consistent(method: str, case: Case) -> None:
     if not case.identification.physically_consistent:
         return
     hint = "" if method in CONSISTENT else f"use {', '.join(CONSISTENT)}, or leave it out"
-    if method == "output_error" and case.fits_within_prior(method):
-        method, hint = "output_error with a prior", "leave one of them out"
     if hint:
         what, where = f"physically_consistent does not go with {method}", f"{case.where}, [identification]"
         raise InputError(what, where=where, hint=hint)

@@ -15,6 +15,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from jaxid.errors import InputError
+from jaxid.estimators.common.best_bodies import NEAREST, nearest_bodies
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.common.shapes import shape_starts
 from jaxid.estimators.estimate import Estimate
@@ -32,6 +33,7 @@ from jaxid.estimators.several.sums import stacked
 from jaxid.estimators.several.weights import disagreement
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
+from jaxid.model.unknowns import Parameters
 from jaxid.numerics.lanes import Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, hessian_notes
@@ -69,7 +71,8 @@ def prediction_error(
     the command of the law is used.
 
     Args:
-        machine: The machine. Its sensor gives the first values of the noise.
+        machine: The machine. Its sensor gives the first values of the noise. If links must be those of real
+            bodies, the fit is without this demand and ends at the nearest such bodies.
         log: The log.
         start: A start of the fit beside the guesses, for example from `inverse_dynamics`, (p,).
         numerics: Settings of the integration; None: exact sticking and the steps that the plant needs.
@@ -139,7 +142,7 @@ def prediction_error_steps(
         what = "hessian" if hessian else "profile"
         raise InputError(f"{what} of innovations goes with one log", hint="leave it out, or name one log")
 
-    fit = _joined(machine, settings, start, numerics)
+    fit = _joined(_without_bodies(machine), settings, start, numerics)
     theta, noises, screened = yield from _best_start(fit, start, alone=alone)
     fit, lowest = yield from _by_floors(fit, theta, noises)
     fit, end = yield from _with_samples_at_rest(fit, lowest)
@@ -148,7 +151,10 @@ def prediction_error_steps(
     theta, reads = end.theta, [np.zeros(m.drives) for m in fit.members]
     if end.converged:
         theta, reads = yield from _corrected_steps(fit, end)
-    estimate = _estimate(fit, end, theta, reads)
+    if machine.parameters.bodies:
+        estimate = yield from _at_bodies(machine.parameters, fit, end, theta, reads)
+    else:
+        estimate = _estimate(fit, end, theta, reads)
     if estimate.converged:
         estimate = yield from _with_bound_at_truth(estimate, fit, lowest.noises)
     if hessian:
@@ -156,6 +162,42 @@ def prediction_error_steps(
     if profile:
         estimate = yield from _with_profiles(estimate, fit, end, theta, profile)
     return estimate
+
+
+def _without_bodies(machine: Machine) -> Machine:
+    """Return the machine with links that need not be those of real bodies."""
+    return machine.with_plant(machine.plant, machine.parameters.without_bodies)
+
+
+def _at_bodies(
+    parameters: Parameters,
+    fit: JointLikelihood,
+    end: Maximum,
+    theta: np.ndarray,
+    reads: Sequence[np.ndarray],
+) -> Steps[Estimate]:
+    """Return the estimate at the real bodies nearest to a fit without them.
+
+    Args:
+        parameters: The unknowns, with their bodies.
+        fit: The likelihood without bodies.
+        end: Its maximum.
+        theta: Estimates, (p,).
+        reads: Noise with which the command of each log was read, (m,).
+    """
+    jacobian, z, counts = stacked(_rows(fit, end, theta))
+    if not (end.converged and np.all(np.isfinite(jacobian[counts])) and np.all(np.isfinite(theta))):
+        estimate = _estimate(fit, replace(end, converged=False), theta, reads)
+    else:
+        rest = float(np.linalg.norm(z[counts]))
+        plain = theta
+        theta, found = nearest_bodies(parameters, jacobian[counts], plain, rest)
+        # The innovations are those before the correction of the bias, as without bodies.
+        there = yield from fit.fit(end.theta + theta - plain, end.noises, 1)
+        there = replace(there, converged=found, steps=end.steps + 1)
+        estimate = _estimate(fit, there, theta, reads)
+    machine = estimate.machine.with_plant(estimate.machine.plant, parameters.with_guess(theta.tolist()))
+    return replace(estimate, machine=machine, notes=(*estimate.notes, NEAREST))
 
 
 def _best_start(
@@ -261,6 +303,7 @@ def _joined(
 
     One number of steps serves all logs, so that they share compiled code.
     """
+    settings = [(replace(p, machine=_without_bodies(p.machine)), rest, noise) for p, rest, noise in settings]
     own = [None if start is None else start[part.index] for part, *_ in settings]
     chosen = [
         needed_numerics(part.machine, part.log, at) if numerics is None else numerics
@@ -323,7 +366,9 @@ def _corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[tuple[np.ndarr
 
     moved = x.copy()
     if np.all(np.isfinite(information)) and np.all(np.isfinite(gradient)):
-        norm = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        norm = np.sqrt(np.maximum(np.diag(information), 0.0))
+        # Rounding over the norm of an unknown that the log does not show at all would be a shift of 1e130.
+        norm[norm == 0] = 1.0
         inverse = np.linalg.pinv(information / np.outer(norm, norm), rcond=_BLIND, hermitian=True)
         shift = -inverse @ (gradient / norm) / norm
         moved[: fit.unknowns] -= shift[: fit.unknowns]

@@ -160,6 +160,12 @@ class Parameters:
         return Parameters(tuple(self.free[k] for k in kept), bodies)
 
     @property
+    def without_bodies(self) -> Parameters:
+        """The same unknowns, with links that need not be those of real bodies, of any sign."""
+        linked = zip(self.free, self.in_bodies, strict=True)
+        return Parameters(tuple(replace(f, sign="free") if inside else f for f, inside in linked))
+
+    @property
     def in_bodies(self) -> Bool[np.ndarray, " p"]:
         """Mask of the unknowns that belong to a body."""
         return np.isin(np.arange(len(self.free)), [k for body in self.bodies for k in body.places])

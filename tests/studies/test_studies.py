@@ -443,8 +443,8 @@ FAULTS = {
     "an estimator that keeps no bodies": (
         '[study]\nestimators = ["inverse_dynamics", "algebraic"]',
         "[identification]\nphysically_consistent = true\n"
-        '[study]\nestimators = ["algebraic", "prediction_error"]',
-        "does not go with prediction_error",
+        '[study]\nestimators = ["algebraic", "minimal_model"]',
+        "does not go with minimal_model",
     ),
     "an estimator that is not there": ('"algebraic"', '"recursion"', "did you mean 'recursive'?"),
 }

@@ -38,8 +38,11 @@ def motion(seed: int, rate: float = RATE) -> tuple[np.ndarray, ...]:
 
 
 def torque(seed: int, bodies: np.ndarray = TRUE) -> tuple[np.ndarray, ...]:
-    t, q, qd, qdd = motion(seed)
-    tau = [arm_oracle.inverse_dynamics(WRIST, bodies, *x, GRAVITY) for x in zip(q, qd, qdd, strict=True)]
+    """Return a motion of the first links and its torque, a link for each body."""
+    t, *parts = motion(seed)
+    q, qd, qdd = (x[:, : len(bodies)] for x in parts)
+    chain = WRIST[: len(bodies)]
+    tau = [arm_oracle.inverse_dynamics(chain, bodies, *x, GRAVITY) for x in zip(q, qd, qdd, strict=True)]
     return t, q, qd, qdd, np.array(tau)
 
 
@@ -50,7 +53,7 @@ def wrist_log(seed: int, noise: float, of_noise: int, bodies: np.ndarray = TRUE)
     return Log(time=t, position=q, force=tau + noise, source=f"wrist {seed}")
 
 
-def case(consistent: bool) -> str:
+def case(consistent: bool, count: int = 3) -> str:
     """Every link starts as a ball of 1 kg off its joint."""
     numbers = "{ guess = %s }"
     ball = ("1.0", ["0.1", "0.05", "0.1"], ["0.03", "-0.005", "-0.01", "0.03", "-0.005", "0.03"])
@@ -58,9 +61,10 @@ def case(consistent: bool) -> str:
     links = "".join(
         f'[[plant.links]]\njoint = "revolute"\nalpha = {alpha!r}\na = {a}\nd = {d}\n'
         f"mass = {numbers % ball[0]}\nfirst_moment = {listed(ball[1])}\ninertia = {listed(ball[2])}\n"
-        for _, alpha, a, d, _ in WRIST
+        for _, alpha, a, d, _ in WRIST[:count]
     )
-    columns = 'position = ["q1", "q2", "q3"]\nforce = ["u1", "u2", "u3"]\n'
+    listed = lambda letter: "[" + ", ".join(f'"{letter}{k + 1}"' for k in range(count)) + "]"
+    columns = f"position = {listed('q')}\nforce = {listed('u')}\n"
     asked = "[identification]\nphysically_consistent = true\n" if consistent else ""
     return f'[plant]\nkind = "serial_arm"\n{links}{asked}[log]\ntime = "t"\n{columns}'
 
@@ -69,24 +73,47 @@ def case(consistent: bool) -> str:
 KP, KD, LOOP_RATE = [600.0, 150.0, 3.0], [30.0, 8.0, 0.15], 200.0
 
 
-def looped(consistent: bool) -> str:
-    """Return the case of the wrist in its loop."""
-    law = f'[controller]\nkind = "pd"\nkp = {KP}\nkd = {KD}\nperiod = {1 / LOOP_RATE}\n'
-    asked = case(True).replace("= true", f"= {str(consistent).lower()}")
-    return asked.replace("[log]\n", '[log]\nreference = ["r1", "r2", "r3"]\n') + law
+def flat_body() -> np.ndarray:
+    """Return the ten parameters of points in a plane through the joint: the edge of what bodies can be."""
+    mass, at = np.array([1.0, 0.5, 0.5]), np.array([[0.3, 0.0, 0.0], [0.1, 0.0, 0.1], [0.2, 0.0, -0.1]])
+    inertia = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(mass, at, strict=True))
+    return np.concatenate([[mass.sum()], mass @ at, inertia[np.triu_indices(3)]])
 
 
-def loop_log(seed: int = 0, of_noise: int = 3) -> Log:
-    """Return a log of the wrist in its loop, by the stepper, with noise of the readings and of the torque."""
+# The first link, and a flat one at the second joint.
+FLAT = np.array([TRUE[0], flat_body()])
+
+
+def missed(found, bodies: np.ndarray) -> float:
+    """RMS of the torque on another motion less the one that is predicted, in part of the former's."""
+    _, q, qd, qdd, tau = torque(9, bodies)
+    predicted = jax.vmap(found.estimate.machine.plant.inertial)(*(jnp.asarray(x) for x in (q, qd, qdd)))
+    return float(np.sqrt(np.mean((tau - predicted) ** 2) / np.mean(tau**2)))
+
+
+def looped(consistent: bool, count: int = 3) -> str:
+    """Return the case of the first links in their loop."""
+    law = f'[controller]\nkind = "pd"\nkp = {KP[:count]}\nkd = {KD[:count]}\nperiod = {1 / LOOP_RATE}\n'
+    asked = case(True, count).replace("= true", f"= {str(consistent).lower()}")
+    references = ", ".join(f'"r{k + 1}"' for k in range(count))
+    return asked.replace("[log]\n", f"[log]\nreference = [{references}]\n") + law
+
+
+def loop_log(seed: int = 0, of_noise: int = 3, bodies: np.ndarray = TRUE, noise: float = NOISE) -> Log:
+    """Return a log of the first links in their loop, a link for each body, by the stepper.
+
+    Readings and torque are noisy.
+    """
     t, q, _, _ = motion(seed, LOOP_RATE)
-    reference = q * np.minimum(1.0, t)[:, None] ** 3
+    n = len(bodies)
+    reference = q[:, :n] * np.minimum(1.0, t)[:, None] ** 3
     geometry = build_machine(load_case(tomllib.loads(looped(True))), period=1 / LOOP_RATE).plant.geometry
     axes, origins = (np.asarray(x) for x in geometry.frames(np.zeros(3)))
-    arm = arm_stepper.Arm(axes, origins, TRUE, np.zeros(3), np.zeros(3))
-    run = arm_stepper.followed(arm, reference, rate=LOOP_RATE, kp=np.array(KP), kd=np.array(KD))
+    arm = arm_stepper.Arm(axes[:n], origins[:n], bodies, np.zeros(n), np.zeros(n))
+    run = arm_stepper.followed(arm, reference, rate=LOOP_RATE, kp=np.array(KP[:n]), kd=np.array(KD[:n]))
     rng = np.random.default_rng(of_noise)
-    position = run["q"] + 1e-5 * rng.standard_normal(q.shape)
-    force = run["u"] + NOISE * rng.standard_normal(q.shape)
+    position = run["q"] + 1e-5 * rng.standard_normal(reference.shape)
+    force = run["u"] + noise * rng.standard_normal(reference.shape)
     return Log(time=t, position=position, force=force, reference=reference, source=f"loop {seed}")
 
 
@@ -126,9 +153,9 @@ def eigenvalues_of(plant) -> np.ndarray:
     return np.linalg.eigvalsh(arm_oracle.pseudo_inertias(ten))
 
 
-def left(found) -> float:
+def left(found, bodies: np.ndarray = TRUE) -> float:
     """RMS of a noisy torque on another motion less the one that is predicted, over the noise."""
-    _, q, qd, qdd, tau = torque(9)
+    _, q, qd, qdd, tau = torque(9, bodies)
     noise = NOISE * np.random.default_rng(5).standard_normal(tau.shape)
     told = jax.vmap(found.estimate.machine.plant.inertial)(*(jnp.asarray(x) for x in (q, qd, qdd)))
     return float(np.sqrt(np.mean((tau + noise - told) ** 2)) / NOISE)

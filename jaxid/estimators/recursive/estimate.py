@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError
+from jaxid.estimators.common.best_bodies import NEAREST, nearest_bodies
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.recursive.bodies import nearest_bodies
 from jaxid.estimators.recursive.precision import details_of, precision_of, weights_together
 from jaxid.estimators.recursive.recursion import (
     Recursion,
@@ -175,8 +175,9 @@ def recursive_steps(
             notes += disagreement(residuals, int(precision.identifiable.sum()))
 
     if machine.parameters.bodies:
-        theta = yield from nearest_bodies(machine, np.asarray(course.memory.root), theta)
-        notes.append("the links are those of the nearest real bodies at the end; the course over time is not")
+        columns = np.linalg.solve(np.asarray(course.memory.root), np.eye(len(theta)))
+        theta, _ = nearest_bodies(machine.parameters, columns, theta)
+        notes.append(f"{NEAREST}; the course over time is without it")
     converged = bool(np.all(np.isfinite(theta)))
     return Estimate(
         method="recursive",

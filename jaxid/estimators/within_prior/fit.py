@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError
+from jaxid.estimators.common.best_bodies import NEAREST, nearest_bodies
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.estimate import Estimate
@@ -39,6 +40,7 @@ from jaxid.estimators.within_prior.precision import (
     SubspacePrecision,
     add_profiles,
     cost_hessian,
+    information_root,
     parameter_precision,
     precision_of_directions,
     profiles_of,
@@ -93,7 +95,8 @@ def within_prior_steps(
     """Fit the identifiable combinations of the unknowns in the loop, and leave the others to the prior.
 
     Args:
-        machine: The machine; its controller closes the loop, which begins at rest.
+        machine: The machine; its controller closes the loop, which begins at rest. If links must be those of
+            real bodies, the fit is without this demand and ends at the nearest such bodies.
         log: The log to fit, or the parts of several. Each column of each of them counts over its spread.
         prior: Relative standard deviation of the guesses.
         on: Output that is compared: "position", "force" or "both". For the latter two the loop is simulated
@@ -168,7 +171,32 @@ def within_prior_steps(
         logs = rows_of(fit)
         notes += disagreement(logs, fit.count)
         details |= by_log(parts, _facts_by_log(fit, logs))
-    return _estimate(machine, fit, whole, tuple(notes), details | multistart | kept_delay(machine, numerics))
+    details |= multistart | kept_delay(machine, numerics)
+    estimate = _estimate(machine, fit, whole, tuple(notes), details)
+    if not machine.parameters.bodies or not np.all(np.isfinite(estimate.theta)):
+        return estimate
+    return _at_bodies(estimate, machine, information_root(fit, precision))
+
+
+def _at_bodies(estimate: Estimate, machine: Machine, root: np.ndarray) -> Estimate:
+    """Return an estimate at the nearest real bodies.
+
+    Args:
+        estimate: Estimate without the demand.
+        machine: The machine that was fitted, whose links must be those of real bodies.
+        root: R, with R'R the information on the unknowns by log and prior, (p, p).
+    """
+    # Noise of one in each sample is the unit of the distance.
+    theta, found = nearest_bodies(machine.parameters, root, estimate.theta, float(estimate.samples) ** 0.5)
+    message = estimate.message if found else "the search for the nearest real bodies did not converge"
+    return replace(
+        estimate,
+        machine=machine.with_estimate(theta),
+        theta=theta,
+        converged=estimate.converged and found,
+        message=message,
+        notes=(*estimate.notes, f"{NEAREST}; criterion and residual are those before"),
+    )
 
 
 def _facts_by_log(fit: SubspaceFit, logs: Sequence[Rows]) -> list[dict[str, Any]]:

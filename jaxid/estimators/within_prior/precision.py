@@ -26,6 +26,8 @@ from jaxid.numerics.rows import Rows, assess_together
 
 # An unknown is identifiable if its posterior standard deviation is below this, in those of its prior.
 _IDENTIFIABLE_STD = 0.5
+# Least eigenvalue of a covariance, relative to the largest, that is more than rounding.
+_LEAST = 1e-15
 # Entries of a unit vector below this are omitted from the named combination.
 _NEGLIGIBLE = 0.1
 
@@ -144,15 +146,11 @@ def parameter_precision(
 
     names = [*machine.parameters.names, *problem.nuisances]
     z = np.asarray(fit.minimum.theta)
-    fitted, unidentifiable = fit.vectors[:, :r], fit.vectors[:, r:]
-    whitened = precision.whitened_covariance
-    if whitened is None:
-        whitened = fitted @ precision.covariance @ fitted.T + unidentifiable @ unidentifiable.T
-
-    slope = problem.prior.slope(np.asarray(problem.prior.outward(fit.point)))
+    unidentifiable = fit.vectors[:, r:]
+    whitened, slope = _whitened_covariance(fit, precision), _slope(fit)
     p = len(problem.places)
     identifiable = np.sqrt(np.diag(whitened))[:p] < _IDENTIFIABLE_STD
-    covariance = (whitened * np.outer(slope, slope))[:p, :p]
+    covariance = whitened[:p, :p] * np.outer(slope, slope)
     covariance[~identifiable] = covariance[:, ~identifiable] = np.nan
 
     stated = [
@@ -171,6 +169,35 @@ def parameter_precision(
         kind=precision.kind,
         curvature=precision.curvature,
     ), stated
+
+
+def _whitened_covariance(fit: SubspaceFit, precision: SubspacePrecision) -> np.ndarray:
+    """Return the posterior covariance of all unknowns in whitened coordinates, (q, q)."""
+    if precision.whitened_covariance is not None:
+        return precision.whitened_covariance
+    fitted, unidentifiable = fit.vectors[:, : fit.count], fit.vectors[:, fit.count :]
+    return fitted @ precision.covariance @ fitted.T + unidentifiable @ unidentifiable.T
+
+
+def _slope(fit: SubspaceFit) -> np.ndarray:
+    """Return the derivatives of the unknowns in their whitened coordinates at the fit, (p,)."""
+    prior = fit.problem.prior
+    return prior.slope(np.asarray(prior.outward(fit.point)))[: len(fit.problem.places)]
+
+
+def information_root(fit: SubspaceFit, precision: SubspacePrecision | None) -> np.ndarray:
+    """Return R, with R'R the inverse of the posterior covariance of the unknowns, (p, p).
+
+    Args:
+        fit: The fit.
+        precision: Precision of the fitted directions; None if no direction is identifiable.
+    """
+    slope = _slope(fit)
+    if precision is None:
+        return np.diag(1.0 / slope)
+    p = len(slope)
+    values, vectors = np.linalg.eigh(_whitened_covariance(fit, precision)[:p, :p])
+    return (vectors / np.sqrt(np.maximum(values, _LEAST * values[-1]))).T / slope
 
 
 def _nothing_identifiable(machine: Machine) -> tuple[Precision, list[dict[str, Any]]]:

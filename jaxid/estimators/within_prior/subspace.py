@@ -160,7 +160,9 @@ def _best_start(problem: Problem, directions: np.ndarray, w: np.ndarray) -> Step
     points = w + (z - directions.T @ w) @ directions.T
     points[0] = w
     e = yield from residuals_at(problem, points)
-    costs = np.sum(e**2, axis=1)
+    # Links that no body can be may run away: their cost is infinite.
+    with np.errstate(over="ignore"):
+        costs = np.sum(e**2, axis=1)
     return points[np.argmin(np.where(np.isfinite(costs), costs, np.inf))]
 
 
