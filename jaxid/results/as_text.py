@@ -12,6 +12,7 @@ from jaxid.model.units import joined
 from jaxid.results import as_json as results
 from jaxid.results.aligned import aligned
 from jaxid.results.by_joint import joint_rows
+from jaxid.results.notes import grouped_notes
 from jaxid.results.parameters import lines_of
 from jaxid.results.precision import precision_lines, ratio_rows
 from jaxid.results.report.numbers import with_std
@@ -276,7 +277,7 @@ def _sum(combination: Mapping[str, float]) -> str:
 
 
 def _notes(lines: Sequence[str]) -> list[str]:
-    return ["", *[f"note: {line}" for line in lines]] if lines else []
+    return ["", *[f"note: {line}" for line in grouped_notes(lines)]] if lines else []
 
 
 def check_table(result: Check) -> str:

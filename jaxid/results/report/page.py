@@ -13,6 +13,7 @@ from markupsafe import Markup
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from jaxid.results.notes import grouped_notes
 from jaxid.results.report import first_page, plots, zoom
 from jaxid.results.report import words as tables
 from jaxid.results.report.data import ExperimentView, HistoryView, LogView, ReportData
@@ -74,7 +75,7 @@ def render(data: ReportData) -> str:
         by_position=by_position,
         rankings=_rankings(data),
         where=tables.where_lines(data),
-        notes=[tables.unbroken(note) for note in data.notes],
+        notes=[tables.unbroken(note) for note in grouped_notes(data.notes)],
         where_figure=_where_figure(data),
         history=_history(data),
         poses=_poses(data),
