@@ -245,7 +245,7 @@ def _search(
         columns = look.regressor if held and step <= _ROUGH_STEPS else columns
         e, jacobian = look.residual, counted(columns, look.rows, weights)
         change = best_step(machine.parameters, jacobian, e, theta)
-        done = settled(jacobian @ change, e, look.signal, machine.parameters)
+        done = settled(jacobian @ change, e, look.signal)
         for _ in range(_HALVINGS):
             rows = None if step <= _CHOOSING else look.rows
             tried = yield from look_at(theta + change, rows)

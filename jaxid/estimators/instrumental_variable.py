@@ -247,7 +247,7 @@ def _search(
         left, slope = by_instruments(bases, e), by_instruments(bases, jacobian)
         change = best_step(unknown, slope, left, theta)
         was = float(np.linalg.norm(left))
-        done = settled(slope @ change, counted(e, masks, weights), size, unknown)
+        done = settled(slope @ change, counted(e, masks, weights), size)
         for _ in range(_HALVINGS):
             tried = yield from along(theta + change)
             if np.linalg.norm(by_instruments(bases, [e for e, _ in tried])) <= was:

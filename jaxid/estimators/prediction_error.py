@@ -185,13 +185,12 @@ def _at_bodies(
         theta: Estimates, (p,).
         reads: Noise with which the command of each log was read, (m,).
     """
-    jacobian, z, counts = stacked(_rows(fit, end, theta))
+    jacobian, _, counts = stacked(_rows(fit, end, theta))
     if not (end.converged and np.all(np.isfinite(jacobian[counts])) and np.all(np.isfinite(theta))):
         estimate = _estimate(fit, replace(end, converged=False), theta, reads)
     else:
-        rest = float(np.linalg.norm(z[counts]))
         plain = theta
-        theta, found = nearest_bodies(parameters, jacobian[counts], plain, rest)
+        theta, found = nearest_bodies(parameters, jacobian[counts], plain)
         # The innovations are those before the correction of the bias, as without bodies.
         there = yield from fit.fit(end.theta + theta - plain, end.noises, 1)
         there = replace(there, converged=found, steps=end.steps + 1)

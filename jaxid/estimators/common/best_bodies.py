@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.estimators.common.levenberg_marquardt import Minimum, Transform, levenberg_marquardt
+from jaxid.estimators.common.interior import inner_start
+from jaxid.estimators.common.levenberg_marquardt import eliminated
 from jaxid.model.unknowns import Parameters
 from jaxid.numerics.kept import kept_jit
 
@@ -20,6 +19,9 @@ NEAREST = (
 # Singular value of the scaled information's root, relative to the largest, below which a direction is not
 # identified: its value, which may be huge, does not count.
 _BLIND = 1e-10
+# Part of the way back to the guess: the best bodies often have no extent some way, and rounding would leave
+# none of them real.
+_INWARD = 1e-8
 
 
 def best_bodies(
@@ -30,7 +32,8 @@ def best_bodies(
 ) -> tuple[Float[np.ndarray, " p"], bool]:
     """Minimise a sum of squares over real bodies and the other unknowns.
 
-    Unidentifiable directions of bodies stay near the guess.
+    Unidentifiable directions of bodies stay near the guess. Another unknown that would pass a bound stays
+    there.
 
     Args:
         parameters: The unknowns; the guesses of the links are real bodies.
@@ -39,19 +42,31 @@ def best_bodies(
         theta: Values of the unknowns, (p,).
 
     Returns:
-        The unknowns at the minimum, (p,), and whether the search for it has converged.
+        The unknowns at the minimum, (p,), and whether it is known to be the minimum.
     """
     # The triangular factor gives the same sum of squares with about as many rows as unknowns.
     triangle = np.asarray(np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r"))
-    found = _best_bodies(triangle, Transform.of(parameters), parameters.guess, parameters.bounds)
-    return np.asarray(found.theta), bool(found.converged)
+    root, rest = triangle[:, :-1], triangle[:, -1]
+    places = tuple(body.places for body in parameters.bodies)
+    within, (lower, upper) = parameters.in_bodies, parameters.bounds
+
+    start, held = parameters.guess, np.zeros(len(theta), bool)
+    while True:
+        # An unknown without a column keeps its start.
+        fixed = rest + root[:, held] @ start[held]
+        best, floor = _interior(np.where(held, 0.0, root), fixed, start, places)
+        found = np.asarray(best)
+        out = ~within & ~held & ((found < lower) | (found > upper))
+        if not out.any():
+            break
+        start, held = np.where(out, np.clip(found, lower, upper), start), held | out
+
+    inward = np.where(within, found + _INWARD * (parameters.guess - found), found)
+    return inward, bool(np.isfinite(floor))
 
 
 def nearest_bodies(
-    parameters: Parameters,
-    columns: Float[np.ndarray, "rows p"],
-    theta: Float[np.ndarray, " p"],
-    rest: float = 0.0,
+    parameters: Parameters, columns: Float[np.ndarray, "rows p"], theta: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, " p"], bool]:
     """Find the values nearest to an estimate whose links are real bodies.
 
@@ -62,27 +77,16 @@ def nearest_bodies(
         parameters: The unknowns; the guesses of the links are real bodies.
         columns: R, with R'R the information of the fit, (rows, p).
         theta: Estimate without the demand, (p,).
-        rest: 2-norm of the residual at the estimate, which says how small a distance is negligible.
 
     Returns:
-        The values, (p,), and whether the search for them has converged.
+        The values, (p,), and whether they are known to be the nearest.
     """
-    size = _sizes(parameters)
+    size, effect = _sizes(parameters), np.any(columns != 0, axis=0)
     _, values, directions = np.linalg.svd(np.linalg.qr(columns * size, mode="r"), full_matrices=False)
     seen = values > _BLIND * values[0]
-    root = values[seen, None] * directions[seen] / size
-    root, e = np.vstack([root, np.zeros(len(theta))]), np.append(np.zeros(len(root)), rest)
-    found, converged = best_bodies(parameters, root, e, theta)
-
-    # Where another unknown ends at a bound, the bodies are found again with it there: an unknown without
-    # effect keeps its guess.
-    lower, upper = parameters.bounds
-    held = ~parameters.in_bodies & ((found <= lower) | (found >= upper))
-    if not held.any():
-        return found, converged
-    moved, guess = np.where(held, found, theta), np.where(held, found, parameters.guess)
-    e = e + root[:, held] @ (found - theta)[held]
-    return best_bodies(parameters.with_guess(guess.tolist()), np.where(held, 0.0, root), e, moved)
+    # Rounding would multiply the huge value of an unknown without effect.
+    root = np.where(effect, values[seen, None] * directions[seen] / size, 0.0)
+    return best_bodies(parameters, root, np.zeros(len(root)), np.where(effect, theta, parameters.guess))
 
 
 def _sizes(parameters: Parameters) -> Float[np.ndarray, " p"]:
@@ -97,7 +101,7 @@ def _sizes(parameters: Parameters) -> Float[np.ndarray, " p"]:
 
 
 @kept_jit
-def _best_bodies(triangle: Array, transform: Transform, guess: Array, bounds: tuple[Array, Array]) -> Minimum:
-    linear = replace(transform, log=np.zeros(guess.size, bool), affine=True)
-    residual = lambda theta: triangle[:, :-1] @ theta + triangle[:, -1]
-    return levenberg_marquardt(residual, guess, linear, *bounds)
+def _interior(
+    columns: Array, rest: Array, start: Array, places: tuple[tuple[int, ...], ...]
+) -> tuple[Float[Array, " p"], Float[Array, ""]]:
+    return inner_start(columns, rest, start, places, eliminated)

@@ -27,9 +27,6 @@ _LOST = 0.5
 _ROUNDING = 1e-6
 # A fit has converged if a step is smaller than this part of a standard deviation for a white residual.
 _SMALL = 1e-2
-# The same for links of real bodies: at the edge of their set the best ones are known to a few hundredths of a
-# standard deviation only.
-_SMALL_AT_EDGE = 1e-1
 
 
 @dataclass(frozen=True)
@@ -168,20 +165,15 @@ def bounded_step(
     return step
 
 
-def settled(
-    change: Float[np.ndarray, " rows"], e: Float[np.ndarray, " rows"], size: float, parameters: Parameters
-) -> bool:
+def settled(change: Float[np.ndarray, " rows"], e: Float[np.ndarray, " rows"], size: float) -> bool:
     """Check that a step changes the residual by less than a hundredth of a standard deviation would.
-
-    Of links that are real bodies a tenth is enough.
 
     Args:
         change: Change of the residual by the step, (rows,).
         e: Residual before the step, (rows,).
         size: 2-norm of the force; a change below 10^-10 of it is rounding.
-        parameters: The unknowns.
     """
-    small = (_SMALL_AT_EDGE if parameters.bodies else _SMALL) * np.linalg.norm(e) / np.sqrt(max(e.size, 1))
+    small = _SMALL * np.linalg.norm(e) / np.sqrt(max(e.size, 1))
     return bool(np.linalg.norm(change) <= max(small, 1e-10 * size))
 
 

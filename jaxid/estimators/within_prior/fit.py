@@ -186,8 +186,7 @@ def _at_bodies(estimate: Estimate, machine: Machine, root: np.ndarray) -> Estima
         machine: The machine that was fitted, whose links must be those of real bodies.
         root: R, with R'R the information on the unknowns by log and prior, (p, p).
     """
-    # Noise of one in each sample is the unit of the distance.
-    theta, found = nearest_bodies(machine.parameters, root, estimate.theta, float(estimate.samples) ** 0.5)
+    theta, found = nearest_bodies(machine.parameters, root, estimate.theta)
     message = estimate.message if found else "the search for the nearest real bodies did not converge"
     return replace(
         estimate,
