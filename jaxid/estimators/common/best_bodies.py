@@ -42,7 +42,8 @@ def best_bodies(
         theta: Values of the unknowns, (p,).
 
     Returns:
-        The unknowns at the minimum, (p,), and whether it is known to be the minimum.
+        The unknowns at the minimum, (p,), and whether they are finite. At the last weights of the interior point rounding
+        may hide how near the minimum is, so that its bound is no test.
     """
     # The triangular factor gives the same sum of squares with about as many rows as unknowns.
     triangle = np.asarray(np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r"))
@@ -54,7 +55,7 @@ def best_bodies(
     while True:
         # An unknown without a column keeps its start.
         fixed = rest + root[:, held] @ start[held]
-        best, floor = _interior(np.where(held, 0.0, root), fixed, start, places)
+        best, _ = _interior(np.where(held, 0.0, root), fixed, start, places)
         found = np.asarray(best)
         out = ~within & ~held & ((found < lower) | (found > upper))
         if not out.any():
@@ -62,7 +63,7 @@ def best_bodies(
         start, held = np.where(out, np.clip(found, lower, upper), start), held | out
 
     inward = np.where(within, found + _INWARD * (parameters.guess - found), found)
-    return inward, bool(np.isfinite(floor))
+    return inward, bool(np.all(np.isfinite(inward)))
 
 
 def nearest_bodies(
@@ -79,7 +80,7 @@ def nearest_bodies(
         theta: Estimate without the demand, (p,).
 
     Returns:
-        The values, (p,), and whether they are known to be the nearest.
+        The values, (p,), and whether they are finite.
     """
     size, effect = _sizes(parameters), np.any(columns != 0, axis=0)
     _, values, directions = np.linalg.svd(np.linalg.qr(columns * size, mode="r"), full_matrices=False)
