@@ -161,7 +161,7 @@ class Parameters:
 
     @property
     def without_bodies(self) -> Parameters:
-        """The same unknowns, with links that need not be those of real bodies, of any sign."""
+        """Unknowns without the demand on links, whose parameters may then have any sign."""
         linked = zip(self.free, self.in_bodies, strict=True)
         return Parameters(tuple(replace(f, sign="free") if inside else f for f, inside in linked))
 

@@ -42,8 +42,8 @@ def best_bodies(
         theta: Values of the unknowns, (p,).
 
     Returns:
-        The unknowns at the minimum, (p,), and whether they are finite. At the last weights of the interior point rounding
-        may hide how near the minimum is, so that its bound is no test.
+        The unknowns at the minimum, (p,), and whether they are finite. At the last weights of the interior
+        point rounding may hide how near the minimum is, so that its bound is no test.
     """
     # The triangular factor gives the same sum of squares with about as many rows as unknowns.
     triangle = np.asarray(np.linalg.qr(np.column_stack([columns, e - columns @ theta]), mode="r"))
