@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -265,7 +265,12 @@ def write_down(rows: list[Row]) -> None:
     (HERE / "results" / "cold.json").write_text(json.dumps(content, indent=1) + "\n")
 
 
-def main() -> int:
+def main(words: Sequence[str] | None = None) -> int:
+    """Time the commands that are wanted; return 1 where an aim is missed.
+
+    Args:
+        words: Arguments; by default those of the process.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--cases", type=int, default=6, help="cases of `discover`")
@@ -273,7 +278,7 @@ def main() -> int:
     parser.add_argument("--against", metavar="TREE", help="time `discover` of another working tree in turn")
     parser.add_argument("--only", default="", help="rows in whose name or group this stands")
     parser.add_argument("--no-write", action="store_true", help="only print")
-    options = parser.parse_args()
+    options = parser.parse_args(words)
     rows = rows_of(options)
     return 0 if all(row.aim is None or row.wall <= row.aim for row in rows) else 1
 

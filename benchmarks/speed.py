@@ -1,8 +1,9 @@
 """Speed of jaxid on one axis, as ratios to hand-written loops and to other tools; and what it grows with.
 
-    python -m benchmarks.speed [--quick] [--no-write] [--only ratios|optimistix|peers|scale]
+    python -m benchmarks.speed [--quick] [--no-write] [--only ratios|optimistix|peers|scale] [--long]
 
-prints the tables and writes results/speed.json and results/speed.md beside this file.
+prints the tables and writes results/speed.json and results/speed.md beside this file. `--long` goes on with
+all commands of `benchmarks.cold`, those of minutes too: one run of every figure that needs no accelerator.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
@@ -26,11 +28,12 @@ os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import axis, speed_scale
+from benchmarks import axis, cold, speed_scale
 from benchmarks import axis_loops as loops
 from benchmarks import axis_rivals as rivals
 from benchmarks.speed_peers import against_peers, installed
 from benchmarks.speed_rows import HEAD, Row, compare, in_process, line, table
+from benchmarks.stored_runs import commit_of
 from jaxid.simulation.replay import Numerics
 
 HERE = Path(__file__).parent
@@ -286,13 +289,14 @@ def versions() -> dict[str, str]:
 
 def report(rows: list[Row], compiled: dict, fits: dict, starts: dict[str, float], scale: dict) -> str:
     shown = ", ".join(f"{k} {v}" for k, v in versions().items())
+    machine = f"{cold.origin()['processor']}, {os.cpu_count()} cores"
     flag = all(c["loop_flag"] for c in compiled.values())
     lines = [
         "# Speed",
         "",
         "Written by `python -m benchmarks.speed`; what is measured is in `benchmarks/README.md`.",
         "",
-        f"{os.cpu_count()} CPU cores, {shown}.",
+        f"Commit {commit_of(HERE.parent)}, {date.today()}; {machine}, {shown}.",
         "",
         *table(rows),
         "",
@@ -318,8 +322,11 @@ def main() -> int:
     parser.add_argument("--no-write", action="store_true", help="only print")
     parts = ("ratios", "optimistix", "peers", "scale")
     parser.add_argument("--only", choices=parts, help="only print this part")
+    parser.add_argument(
+        "--long", action="store_true", help="then all commands of benchmarks.cold, minutes each"
+    )
     options = parser.parse_args()
-    n, few, cold = (5, 2, 1) if options.quick else (41, 5, 3)
+    n, few, fresh = (5, 2, 1) if options.quick else (41, 5, 3)
     if options.only == "scale":
         print("\n".join(speed_scale.tables(speed_scale.measured(quick=options.quick))))
         return 0
@@ -327,22 +334,25 @@ def main() -> int:
     print(HEAD)
     own = {
         "ratios": lambda: comparisons(sides, n, few),
-        "optimistix": lambda: against_optimistix(sides, n, cold),
+        "optimistix": lambda: against_optimistix(sides, n, fresh),
         "peers": lambda: against_peers(sides, few),
     }
     rows = [row for part in own if options.only in (None, part) for row in own[part]()]
     if options.only:
         return 0
     compiled = compile_times(sides)
-    fits, starts = cold_fits(cold), start_times(3 * cold)
+    fits, starts = cold_fits(fresh), start_times(3 * fresh)
     scale = speed_scale.measured(quick=options.quick)
     text = report(rows, compiled, fits, starts, scale)
-    print("\n" + text)
+    print("\n" + text, flush=True)
     if not options.no_write:
         folder = HERE / "results"
         folder.mkdir(exist_ok=True)
         (folder / "speed.md").write_text(text)
         data = {
+            "commit": commit_of(HERE.parent),
+            "date": str(date.today()),
+            "processor": cold.origin()["processor"],
             "cpu_count": os.cpu_count(),
             "versions": versions(),
             "rows": [asdict(r) for r in rows],
@@ -352,6 +362,10 @@ def main() -> int:
             "scale": scale,
         }
         (folder / "speed.json").write_text(json.dumps(data, indent=1) + "\n")
+    if options.long:
+        print("# Commands from cold\n", flush=True)
+        less = ["--repeats", "1"] if options.quick else []
+        cold.main(["--long", *less, *(["--no-write"] if options.no_write else [])])
     return 0
 
 
