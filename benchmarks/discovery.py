@@ -17,12 +17,13 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
+from datetime import date
 from pathlib import Path
 
 from tqdm import tqdm
 
 from benchmarks.discovery_table import aims_hold, markdown, summary
-from benchmarks.stored_runs import read_runs
+from benchmarks.stored_runs import commit_of, read_runs
 from truth.hidden import cases as hidden_cases
 from truth.hidden import chains as hidden_chains
 from truth.hidden.bench import Case
@@ -53,7 +54,7 @@ def main() -> int:
     done = {r["id"] for r in read_runs(lines)}
     if options.workers > 1:
         os.environ |= ONE_THREAD
-    run([c for c in chosen if c.id not in done], lines, options.workers)
+    run([c for c in chosen if c.id not in done], lines, options.workers, refit=options.refit)
     if options.cold:
         measure_cold(chosen[:: max(1, len(chosen) // COLD)][:COLD], folder / "cold.json")
     ids = {c.id for c in chosen}
@@ -61,6 +62,7 @@ def main() -> int:
     table = summary(
         [r for r in read_runs(lines) if r["id"] in ids], json.loads(cold.read_text()) if cold.exists() else []
     )
+    table["made"] = f"`python -m benchmarks.discovery --split {options.split}` on {date.today()}"
     (folder / "discovery.json").write_text(json.dumps(table, indent=1))
     (folder / "discovery.md").write_text(markdown(table))
     print(markdown(table))
@@ -79,6 +81,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--cold", action="store_true", help=f"time {COLD} fresh commands too")
     parser.add_argument("--resume", action="store_true", help="skip the cases that are done")
+    parser.add_argument(
+        "--no-refit", dest="refit", action="store_false", help="leave out the refit in simulation"
+    )
     parser.add_argument("--oracle", action="store_true", help="let it speak anew of what is done")
     parser.add_argument("-o", metavar="DIR", default=str(ROOT / "results" / "discovery"))
     return parser.parse_args()
@@ -111,8 +116,15 @@ def ask_again(lines: Path, cases: dict[str, Case]) -> None:
     fresh.replace(lines)
 
 
-def run(chosen: Sequence[Case], lines: Path, workers: int) -> None:
-    """Run the cases, those of one shape in one process."""
+def run(chosen: Sequence[Case], lines: Path, workers: int, *, refit: bool) -> None:
+    """Run the cases, those of one shape in one process.
+
+    Args:
+        chosen: Cases.
+        lines: File to which a line of JSON each is added.
+        workers: Number of processes.
+        refit: Whether models are refitted in simulation, as the command does.
+    """
     groups: dict[tuple, list[Case]] = {}
     for case in sorted(chosen, key=lambda c: (c.length, str(c.declared))):
         groups.setdefault((case.scale, case.rate), []).append(case)
@@ -123,7 +135,7 @@ def run(chosen: Sequence[Case], lines: Path, workers: int) -> None:
     )
     with pool, tqdm(total=len(chosen), unit="case", desc="hidden cases") as bar:
         before = len(read_runs(lines))
-        left: set[Future] = {pool.submit(_work, group, str(lines)) for group in largest_first}
+        left: set[Future] = {pool.submit(_work, group, str(lines), refit) for group in largest_first}
         while left:
             finished, left = wait(left, timeout=2.0, return_when="FIRST_COMPLETED")
             for future in finished:
@@ -131,12 +143,13 @@ def run(chosen: Sequence[Case], lines: Path, workers: int) -> None:
             bar.update(len(read_runs(lines)) - before - bar.n)
 
 
-def _work(group: Sequence[Case], lines: str) -> None:
+def _work(group: Sequence[Case], lines: str, refit: bool) -> None:
     from benchmarks.hidden_run import run_case
 
+    commit = commit_of(ROOT)
     with tempfile.TemporaryDirectory() as folder:
         for k, case in enumerate(group):
-            record = run_case(case, Path(folder)) | {"warm": k > 0}
+            record = run_case(case, Path(folder), refit=refit) | {"warm": k > 0, "commit": commit}
             with open(lines, "a") as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
                 file.write(json.dumps(record) + "\n")

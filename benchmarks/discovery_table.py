@@ -46,6 +46,8 @@ def summary(records: Sequence[Record], cold: Sequence[dict] = ()) -> dict:
     }
     return {
         "counts": {group: len(rows) for group, rows in by.items()},
+        "origin": _origin(records),
+        "named": _named(single, pairs, nulls),
         "totals": totals,
         "effects": [_row(k, n, rows) for k, rs in kinds.items() for n, rows in _by_noise(rs)],
         "pairs": [_row(k, "all", [r for r in pairs if r["what"] == k]) for k in _whats(pairs)],
@@ -79,7 +81,13 @@ def share(truths: Iterable[bool]) -> float | None:
 
 def markdown(table: dict) -> str:
     """Return the page in Markdown."""
-    parts = ["# Discovery on hidden effects", _lines("Cases", table["counts"]), "## Aims"]
+    parts = [
+        "# Discovery on hidden effects",
+        f"Written by {table['made']}; {table['origin']}.",
+        _lines("Cases", table["counts"]),
+        table["named"],
+        "## Aims",
+    ]
     rows = [
         [name, _text(value), f"{'<=' if AIMS[name][1] else '>='} {AIMS[name][0]:g}",
          "" if value is None else "yes" if holds(name, value) else "NO"]
@@ -110,6 +118,33 @@ def glance(table: dict) -> str:
         )  # fmt: skip
     heads = ["hidden", *[n if n == "all" else f"noise {n}" for n in noises], "closed", "s", "wrong"]
     return _grid(heads, rows)
+
+
+def _origin(records: Sequence[Record]) -> str:
+    """Say on which code the records were made, and with which last fit."""
+    commits = Counter(r.get("commit", "unknown") for r in records)
+    of = ", ".join(
+        f"{commit} ({count} cases)" if len(commits) > 1 else commit for commit, count in commits.items()
+    )
+    last = Counter(r.get("method", "no result") for r in records if r.get("refit", False))
+    refits = ", ".join(f"{count} by {method.replace('_', ' ')}" for method, count in last.most_common())
+    without = sum(not r.get("refit", False) for r in records)
+    words = [f"refitted as the command does, the values kept are {refits}" if last else ""]
+    words.append(f"{without} without the refit" if without else "")
+    return f"commit {of}; " + "; ".join(filter(None, words))
+
+
+def _named(single: Sequence[Record], pairs: Sequence[Record], nulls: Sequence[Record]) -> str:
+    """Count what is named alone, what is named as one of rivals, and what is not called complete."""
+    strictly, alike = (sum(map(judged, single)) for judged in (judge.strictly_right, judge.right))
+    both = sum(map(judge.right, pairs))
+    false = sum(map(judge.false_positive, nulls))
+    return (
+        f"Of visible single effects {strictly} of {len(single)} are named strictly, {alike} strictly or as "
+        "one of rivals that explain both logs as well. "
+        f"Of visible pairs both are named in {both} of {len(pairs)}. "
+        f"Of {len(nulls)} complete models {false} are not called complete."
+    )
 
 
 def _visible(records: Iterable[Record]) -> list[Record]:

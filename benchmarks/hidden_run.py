@@ -16,8 +16,14 @@ from truth.hidden.cases import HiddenCase
 Record = dict
 
 
-def run_case(case: Case, folder: Path) -> Record:
-    """Return the oracle's evidence and the result of jaxid, for JSON."""
+def run_case(case: Case, folder: Path, *, refit: bool = False) -> Record:
+    """Search one case, and return the oracle's evidence with the result, for JSON.
+
+    Args:
+        case: The case.
+        folder: Folder in which its files are written.
+        refit: Whether the models are refitted in simulation, as the command does.
+    """
     record = {
         "id": case.id, "group": case.group, "what": case.what, "scale": case.scale,
         "noise": case.noise, "seed": case.seed, "rate": case.rate, "hidden": list(case.names),
@@ -25,23 +31,23 @@ def run_case(case: Case, folder: Path) -> Record:
         "oracle": oracle(case),
     }  # fmt: skip
     try:
-        return record | _searched(case, folder)
+        return record | _searched(case, folder, refit)
     except jaxid.InputError as error:
         return record | {"verdict": "refused", "named": [], "error": str(error)}
     except Exception as error:  # the bench must survive it; it counts as wrong
         return record | {"verdict": "crashed", "named": [], "error": repr(error)}
 
 
-def _searched(case: Case, folder: Path) -> Record:
+def _searched(case: Case, folder: Path, refit: bool) -> Record:
     logs = [logged(case, validation=v) for v in ((False, True) if case.validated else (False,))]
     path = write_case(folder, text_of(case))
     begin, busy = time.perf_counter(), time.process_time()
-    d = jaxid.discover(path, logs[0], validate=logs[1:], refit=False)
+    d = jaxid.discover(path, logs[0], validate=logs[1:], refit=refit)
     seconds, busy = time.perf_counter() - begin, time.process_time() - busy
     return {
         "verdict": d.verdict, "named": [e.label for e in d.effects],
         "seconds": seconds, "cpu_seconds": busy,
-        "samples": logs[0].samples,
+        "samples": logs[0].samples, "refit": refit, "method": d.after.method,
         "evidence": [_number(e.score.total) for e in d.effects],
         "alternatives": [[s.candidate.label for s in e.alternatives] for e in d.effects],
         "parameters": _parameters(case, d),
