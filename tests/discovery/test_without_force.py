@@ -3,12 +3,14 @@
 import dataclasses
 import json
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import jaxid
 from benchmarks.unforced_machines import command_of, servo
+from jaxid.discovery.in_loop.positions import LoopAcceptance, PositionDomain
 from jaxid.errors import InputError
 from tests.estimators.test_unforced import CASE, DELAY, FREE, TRUE, log
 from truth.axis.machines import Setup, moves, multisine
@@ -42,6 +44,21 @@ def without(text: str, *lines: str) -> str:
         assert line in text
         text = text.replace(line, "")
     return text.replace("period = 0.001", "period = 0.002")
+
+
+def test_a_gap_of_positions_closes_by_joint_as_well():
+    """Its size is that of each joint; the 1e-5 of its motion that integration leaves wrong is no gap."""
+    measured = np.random.default_rng(0).standard_normal((400, 2))
+    moving = np.ones(measured.shape, bool)
+    samples = SimpleNamespace(moving=moving, measured=measured, view=None)
+    samples.parts = (samples,)
+    accepted = LoopAcceptance(
+        None, None, (), np.full(2, 1e-3), (), positions=PositionDomain(None, 1e-3), logs=(samples,)
+    )
+    old = measured * [1.0, 0.01]
+    assert accepted.closed(old, old * [1.0, 0.1]) < 1e-3
+    assert accepted.closed_somewhere(old, old * [1.0, 0.1]) == pytest.approx(1.0, abs=0.01)
+    assert accepted.closed_somewhere(1e-6 * measured, 1e-7 * measured) == 0.0
 
 
 @pytest.mark.slow

@@ -308,6 +308,7 @@ class LoopAcceptance(Acceptance):
             np.sum(part.moving * np.square(NUMERICS * _scaled(part, np.std(part.measured, axis=0))), axis=0)
             for part in self.samples.parts
         )
+        self._numerics_of_joints = self._numerics
         self._noise = self.samples.moving.sum(axis=0) * np.square(self.floor)
 
     @property
