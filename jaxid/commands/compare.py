@@ -19,7 +19,8 @@ from jaxid.consistency.absent import acts_by_position
 from jaxid.discovery.in_loop.unforced import loop_machine, loop_superset
 from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.errors import InputError
-from jaxid.estimators import need_alike, need_known_controller, need_known_reference, steps_of
+from jaxid.estimators import steps_of
+from jaxid.estimators.needs import need_alike, need_known_controller, need_known_reference
 from jaxid.estimators.several.force import inverse_dynamics_steps
 from jaxid.estimators.several.parts import parts_of
 from jaxid.logs.in_memory import LogLike

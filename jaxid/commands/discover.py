@@ -29,13 +29,13 @@ from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.discovery.together import LEAST_AT_ONCE, add_together
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
-from jaxid.estimators import need_force, need_known_controller, need_known_reference
 from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.common.consistency import need_bodies, with_links
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
+from jaxid.estimators.needs import need_force, need_known_controller, need_known_reference
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
 from jaxid.estimators.several.parts import parts_of
 from jaxid.gap import Gap, force_gap, gaps, noise_floor

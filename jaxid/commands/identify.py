@@ -14,13 +14,14 @@ from jaxid.case.case import Case, CaseLike, load_case
 from jaxid.case.user_faults import named_faults
 from jaxid.commands.robot_case import implied_case
 from jaxid.errors import InputError, suggest
-from jaxid.estimators import refuse_without_likelihood, steps_of
+from jaxid.estimators import steps_of
 from jaxid.estimators.choice import choose_method, with_choice
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimiser_of
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.loop_noise import with_loop_noise
+from jaxid.estimators.needs import refuse_without_likelihood
 from jaxid.gap import Gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.names import METHODS, OUTPUTS, SEVERAL_LOGS, SOLVERS, USER_METHODS

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxid.case.case import Case
 from jaxid.errors import InputError
-from jaxid.estimators import need_consistent, need_likelihood
+from jaxid.estimators.needs import need_consistent, need_likelihood
 from jaxid.machine import Machine
 from jaxid.names import DISCOVER, IN_LOOP, SEVERAL_LOGS, USER_METHODS
 from jaxid.numerics.lanes import accelerator, cores
