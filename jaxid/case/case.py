@@ -6,35 +6,32 @@ import contextlib
 import difflib
 import sys
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxid.case.contradictions import refuse_contradictions, refuse_without_loop
 from jaxid.case.declared import EffectEntry, PlantEntry, own_effects
 from jaxid.case.entries import check_kinds, read_effects, read_kind, read_plant, read_search
 from jaxid.case.kinds import Kinds, NeedsClassesError, declared_kinds, loaded_kinds
+from jaxid.case.log_entries import FitEntry, Validation, fits_of, log_of, validations_of
 from jaxid.case.reference import read_signal, read_unknown_reference
 from jaxid.case.sensors import read_inertial_sensors
 from jaxid.case.tables import (
     TOP,
-    UNKNOWN_OF_CONTROLLER,
     ControllerTable,
     controller_keys,
     controller_table,
-    fit_keys,
-    validation_keys,
 )
 from jaxid.case.values import Value
 from jaxid.errors import InputError, suggest
-from jaxid.model.parameter import parameters_of
 from jaxid.names import DISCOVER, HOLDS
-from jaxid.schema import Counts, Spot, keys_of, plain, read_settings, read_table
+from jaxid.schema import Counts, Spot, plain, read_settings, read_table
 from jaxid.settings import (
     Actuator,
     Algebraic,
     DesignTable,
-    Disturbance,
     Identification,
     InertialSensor,
     LimitsTable,
@@ -46,7 +43,6 @@ from jaxid.settings import (
     SimulationTable,
     StudyTable,
     WithinPrior,
-    log_table,
 )
 
 if TYPE_CHECKING:
@@ -54,33 +50,6 @@ if TYPE_CHECKING:
 
 # Name of a case that is a dict, in messages and results.
 UNNAMED = "case"
-
-
-@dataclass(frozen=True)
-class Validation:
-    """One of [[validation]].
-
-    Args:
-        name: Name in results.
-        log: Its file; None: the fitted log.
-        columns: Its [log] table, complete: for `jaxid.logs.log.read_log`.
-        disturbance: The controller's on this log: a square wave, or the name of a column.
-        known: Values of parameters that are known in this log, by their names in results.
-    """
-
-    name: str
-    log: Path | None
-    columns: LogTable
-    disturbance: Disturbance | str | None = None
-    known: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class FitEntry(Validation):
-    """One of [[fit]]: a log that is fitted with the others.
-
-    Its `log` is None if it takes the first log of the command.
-    """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,7 +300,7 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path, kinds:
         plant=plant,
         effects=_all_effects(tables, plant, root, kinds),
         actuator=read(Actuator, "actuator"),
-        log=_log(tables, root),
+        log=log_of(tables, root),
         preprocess=read(Preprocess, "preprocess"),
         identification=read(Identification, "identification"),
         algebraic=read(Algebraic, "algebraic"),
@@ -342,8 +311,8 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path, kinds:
         sensor=read(SensorTable, "sensor"),
         inertial_sensors=read_inertial_sensors(tables, plant.cls.links(plant.joints), root),
         limits=read(LimitsTable, "limits"),
-        fits=_fits(tables, root),
-        validations=_validations(tables, root),
+        fits=fits_of(tables, root),
+        validations=validations_of(tables, root),
         candidates=candidates,
         kinds=searched,
         design=read(DesignTable, "design") if tables.get("design") else None,
@@ -354,15 +323,9 @@ def read_case(tables: Mapping[str, Any], path: Path | None, folder: Path, kinds:
         study=read(StudyTable, "study"),
     )
 
-    # Keys that are sound by themselves may contradict each other.
-    _check_transmission(case, root)
-    _check_drive(case, tables, root)
-    _check_labels(case, root)
-    _check_preprocess(tables.get("preprocess", {}), root)
-    _check_recursive(tables.get("recursive", {}), root)
+    refuse_contradictions(case, tables, root)
     check_kinds(_others(case, kinds.effects), root)
-    _check_loop(case, root)
-    _check_command(case, root, kinds)
+    refuse_without_loop(case, root, kinds)
     return case
 
 
@@ -431,76 +394,6 @@ def _toml(path: Path) -> dict[str, Any]:
         raise InputError(what, where=str(path), hint="name a TOML file that may be read") from error
 
 
-# Only a transmission needs numpy, and only stated units their reader: neither should delay other refusals.
-def _check_transmission(case: Case, root: Spot) -> None:
-    rows, spot = case.actuator.transmission, root.under("[actuator]").at("transmission")
-    if rows is None:
-        return
-    plant, joints = case.plant, case.plant.joints
-    if joints == 1:
-        hint = "leave it out; a ratio of gears goes into gain"
-        raise spot.fault("is for plants with several joints", hint)
-    if plant.drives < joints:
-        hint = "leave it out, and take a log of the joints"
-        raise spot.fault(f"is for plants with a drive for each joint, not {plant.drives} for {joints}", hint)
-    import numpy as np
-
-    if {len(rows), *map(len, rows)} != {joints} or np.linalg.matrix_rank(rows) < joints:
-        hint = f"give {joints} rows of {joints} numbers, none a sum of others"
-        raise spot.fault("is not an invertible square matrix", hint)
-    if case.controller is not None:
-        hint = "leave [controller] out: the log is then identified without the loop"
-        raise spot.fault("does not go with a loop, whose gains are at the motors", hint)
-    gears = [n for n, i in parameters_of(plant.cls).items() if i.known and n in plant.parameters]
-    if gears:
-        hint = "keep transmission if the log is of the motors' angles, else the other"
-        raise spot.fault(f"and {gears[0]} of [plant.parameters] are both given", hint)
-
-
-def _check_drive(case: Case, tables: Mapping[str, Any], root: Spot) -> None:
-    """Refuse a drive that is described twice, and words on it that convert nothing."""
-    given, spot = tables.get("actuator", {}), root.under("[actuator]")
-    if case.actuator.torque_constant is not None:
-        for key in ("gain", "transmission"):
-            if key in given:
-                hint = "keep gain, the force for the logged command, or torque_constant"
-                raise spot.at(key).fault("does not go with torque_constant", hint)
-    else:
-        for key in ("gear_ratio", "lead"):
-            if key in given and "gain" not in given:
-                hint = "state gain (ratio times efficiency for a logged motor torque) or torque_constant"
-                raise spot.at(key).fault("leaves open what the logged command is", hint)
-    if case.log is not None and case.log.counts_per_revolution is not None and case.log.units is not None:
-        from jaxid.logs.units import parse_unit
-
-        given = case.log.units.values()
-        texts = [text for unit in given for text in ((unit,) if isinstance(unit, str) else unit)]
-        if "count" not in {unit.kind for unit in map(parse_unit, texts) if unit is not None}:
-            hint = 'add units = { position = "count" }, or leave it out'
-            raise root.under("[log]").at("counts_per_revolution").fault("converts nothing", hint)
-
-
-def _check_labels(case: Case, root: Spot) -> None:
-    """Refuse labels of [plant] units that look as if they converted: mm, deg, kN."""
-    for quantity in ("position", "force"):
-        label = getattr(case.plant.units, quantity)
-        if label is None:
-            continue
-        from jaxid.logs.units import parse_unit
-
-        unit = parse_unit(label)
-        mechanical = (
-            unit is not None and unit.kind in ("length", "angle", "force", "torque") and unit.factor != 1.0
-        )
-        if mechanical and unit is not None and unit.per == 0:
-            hint = f'state [log] units = {{ {quantity} = "{label}" }}, which converts; results are in SI'
-            raise (
-                root.under("[plant]")
-                .at(f"units.{quantity}")
-                .refuse(label, "is a label, and converts nothing", hint)
-            )
-
-
 def _within_prior(tables: Mapping[str, Any], settings: OutputError, root: Spot) -> WithinPrior | None:
     """Return [within_prior]; or the same by the older keys of [output_error]."""
     given, spot = tables.get("output_error", {}), root.under("[output_error]")
@@ -519,152 +412,9 @@ def _within_prior(tables: Mapping[str, Any], settings: OutputError, root: Spot) 
     return WithinPrior(**{key: getattr(settings, key) for key in given})
 
 
-def _check_preprocess(given: Mapping[str, Any], root: Spot) -> None:
-    """Refuse keys of a low-pass beside those of a parabola."""
-    parabolic, spot = given.get("derivatives") == "parabolic", root.under("[preprocess]")
-    if "reach" in given and not parabolic:
-        hint = 'add derivatives = "parabolic", or leave it out'
-        raise spot.at("reach").fault("is that of a parabola", hint)
-    for key in ("cutoff_hz", "order"):
-        if key in given and parabolic:
-            what = 'is of a low-pass, which derivatives = "parabolic" does without'
-            raise spot.at(key).fault(what, "leave out one of them")
-
-
-def _check_recursive(given: Mapping[str, Any], root: Spot) -> None:
-    """Refuse a start beside a run to go on from."""
-    for key in ("start", "regularization"):
-        if "restart" in given and key in given:
-            spot = root.under("[recursive]").at(key)
-            raise spot.fault("does not go with restart", "leave out one of them")
-
-
-def _log(tables: Mapping[str, Any], root: Spot) -> LogTable | None:
-    if "log" not in tables:
-        return None
-    return _time_base(log_table(tables["log"], root.under("[log]")), root.under("[log]"))
-
-
-def _time_base(table: LogTable, spot: Spot) -> LogTable:
-    """Return the table of a log; refuse two time bases."""
-    if table.time is not None and table.sample_rate is not None:
-        raise spot.fault("both time and sample_rate are given", "keep one of them")
-    return table
-
-
 def _controller(tables: Mapping[str, Any], root: Spot, kinds: Kinds) -> ControllerTable | None:
     if "controller" not in tables:
         return None
     table, spot = tables["controller"], root.under("[controller]")
     kind = read_kind(table, kinds.laws, spot)
     return controller_table(read_table(table, controller_keys(kind, kinds), spot))
-
-
-def _validations(tables: Mapping[str, Any], root: Spot) -> tuple[Validation, ...]:
-    out: list[Validation] = []
-    for k, table in enumerate(tables.get("validation", []), start=1):
-        spot = root.under(f"[[validation]] {k}")
-        given = read_table(table, validation_keys(), spot)
-        _check_name(given["name"], out, spot)
-        if "log" not in given and "rows" not in table:
-            hint = "add log = <its file>, or rows that the fit does not use"
-            raise spot.fault("this validation log is identical to the fitted log", hint)
-        log = root.folder / given["log"] if "log" in given else None
-        out.append(
-            Validation(given["name"], log, *_of_log(tables, table, given, spot, same_file=log is None))
-        )
-    return tuple(out)
-
-
-def _fits(tables: Mapping[str, Any], root: Spot) -> tuple[FitEntry, ...]:
-    out: list[FitEntry] = []
-    for k, table in enumerate(tables.get("fit", []), start=1):
-        spot = root.under(f"[[fit]] {k}")
-        given = read_table(table, fit_keys(), spot)
-        if "name" not in given and "log" not in given:
-            raise spot.fault("has neither name nor log", "add log = <its file>, or name for the first LOG")
-        log = root.folder / given["log"] if "log" in given else None
-        name = given["name"] if log is None else given.get("name", log.stem)
-        if log is not None and "name" not in given and name in [entry.name for entry in out]:
-            name = f"{log.parent.name}/{name}"
-        _check_name(name, out, spot)
-        out.append(FitEntry(name, log, *_of_log(tables, table, given, spot, same_file=log is None)))
-    return tuple(out)
-
-
-def _check_name(name: str, others: Sequence[Validation], spot: Spot) -> None:
-    """Refuse the name of another entry."""
-    if name in [entry.name for entry in others]:
-        raise spot.at("name").refuse(name, "is taken", "give each a different name")
-
-
-def _of_log(
-    tables: Mapping[str, Any],
-    table: Mapping[str, Any],
-    given: Mapping[str, Any],
-    spot: Spot,
-    *,
-    same_file: bool,
-) -> tuple[LogTable, Disturbance | str | None, Mapping[str, float | tuple[float, ...]]]:
-    """Return columns, disturbance and known values of an entry that names a log."""
-    columns = {name: table[name] for name in keys_of(LogTable) if name in table}
-    merged = log_table(_merged(tables.get("log", {}), columns, same_file=same_file), spot)
-    of_fit = (tables.get("controller") or {}).get("disturbance")
-    disturbance = given["disturbance"] if "disturbance" in given else _disturbance(of_fit)
-    return _time_base(merged, spot), disturbance, given.get("set", {})
-
-
-def _disturbance(given: Any) -> Disturbance | str | None:
-    """Return the disturbance of [controller], which was checked there."""
-    return Disturbance(**{k: float(v) for k, v in given.items()}) if isinstance(given, dict) else given
-
-
-def _merged(base: Mapping[str, Any], columns: Mapping[str, Any], *, same_file: bool) -> dict[str, Any]:
-    """Return [log] with the keys that differ; rows of one file mean nothing in another."""
-    dropped = set() if same_file else {"rows"}
-    # One time base takes the place of the other.
-    dropped |= {"time"} if "sample_rate" in columns else set()
-    dropped |= {"sample_rate"} if "time" in columns else set()
-    return {**{key: value for key, value in base.items() if key not in dropped}, **columns}
-
-
-def _check_command(case: Case, root: Spot, kinds: Kinds) -> None:
-    """Refuse effects on the command without a controller, or beside the same key of [controller]."""
-    for entry in case.effects:
-        kind, name, spot = entry.cls.kind, entry.cls.controller_field, root.under("[[effects]]")
-        if name is None:
-            continue
-        if case.controller is None:
-            hint = "add [controller], or leave the effect out"
-            raise spot.fault(f"{kind} acts on the command of a controller, and there is none", hint)
-        if name in case.controller.law:
-            hint = "state it in one of the two places"
-            raise spot.fault(f"{kind} and [controller] {name} are both given, and are the same", hint)
-        if sum(other.cls is entry.cls for other in case.effects) > 1 and not _apart(case, entry.cls):
-            raise spot.fault(f"{kind} is given twice for one joint", "state it once")
-        if name not in controller_keys(case.controller.kind, kinds) and name in UNKNOWN_OF_CONTROLLER:
-            hint = "take another law, or leave the effect out"
-            what = f"{kind} does not go with [controller] kind = '{case.controller.kind}', which has no error"
-            raise spot.fault(what, hint)
-
-
-def _apart(case: Case, cls: type[Effect]) -> bool:
-    """Check that the entries of an effect are on different joints."""
-    ports = [port for entry in case.effects if entry.cls is cls for port in entry.ports]
-    return len(set(ports)) == len(ports)
-
-
-def _check_loop(case: Case, root: Spot) -> None:
-    """Refuse entries that only a loop could use, if there is none."""
-    if case.controller is None:
-        if case.reference is not None:
-            hint = "add [controller], or call it [input] for open loop"
-            raise root.under("[reference]").fault("there is no loop to follow it", hint)
-        for table, entries in (("fit", case.fits), ("validation", case.validations)):
-            for k, entry in enumerate(entries, start=1):
-                if entry.disturbance is not None:
-                    spot = root.under(f"[[{table}]] {k}").at("disturbance")
-                    raise spot.fault("belongs to a controller", "add [controller], or leave it out")
-    if case.reference is not None and case.input is not None:
-        hint = "keep [reference] for closed loop, or [input] for open loop"
-        raise root.fault("both [reference] and [input] are given", hint)

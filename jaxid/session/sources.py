@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from jaxid.case.case import Case, FitEntry
+from jaxid.case.case import Case
+from jaxid.case.log_entries import FitEntry
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from jaxid.case.case import Case, FitEntry
+from jaxid.case.case import Case
+from jaxid.case.log_entries import FitEntry
 from jaxid.machine import Machine
 from jaxid.own_values import OwnValues, expanded, own_values
 
