@@ -349,6 +349,8 @@ def _loud(e: np.ndarray, counts: np.ndarray, data: Prepared) -> tuple[tuple[floa
     share = np.convolve(counts.astype(float), kernel, mode="same")
     local = np.convolve(energy, kernel, mode="same") / np.maximum(share, 1)
     counted = share > _WINDOW / 2
+    if not np.any(counted):  # the joint never moves for as long as a window
+        return ()
     usual = np.median(local[counted])
     # An effect that distorts the fit leaves some residual everywhere, but little beside the loudest window.
     loud = counted & (local > np.maximum(_LOUD * usual, _QUIET * local[counted].max()))

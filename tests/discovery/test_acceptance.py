@@ -13,7 +13,7 @@ from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
 from jaxid.discovery.screen import has_influence
 from jaxid.discovery.search import Model
-from jaxid.discovery.where import _bin_offset
+from jaxid.discovery.where import _bin_offset, _loud
 from jaxid.gap import noise_density
 from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.session import open_session
@@ -224,6 +224,18 @@ def test_a_line_is_placed_between_the_bins(true):
     k = int(np.argmax(power))
     assert k + _bin_offset(power, k) == pytest.approx(true, abs=0.03)
     assert _bin_offset(power, 0) == 0.0
+
+
+def test_a_joint_that_moves_in_short_spells_has_no_loud_interval():
+    """A case of the hidden bench ended in an error of numpy here: no window had half of its samples moving."""
+    e, data = np.zeros(100), SimpleNamespace(times=np.arange(100) * 5e-3)
+    counts = np.arange(100) % 25 < 6
+    e[counts] = 1.0
+    assert _loud(e, counts, data) == ()
+    steady = np.random.default_rng(0).standard_normal(100)
+    steady[40:60] *= 20.0
+    [(start, end)] = _loud(steady, np.ones(100, bool), data)
+    assert start < 0.25 < end
 
 
 def test_a_limit_that_no_sample_reaches_has_no_influence(tmp_path):
