@@ -82,8 +82,11 @@ class Candidate:
 
     @property
     def has_grid(self) -> bool:
-        """True if the starts are evaluated on a plant without other effects."""
-        return len(self.starts) > _FEW
+        """True if the starts are evaluated on a plant without other effects.
+
+        An effect in the drive is not: what it does depends on the force at hand.
+        """
+        return len(self.starts) > _FEW and bool(self.amplitude.any())
 
     def probe(self, start: int) -> np.ndarray:
         """Return the values at which its columns are computed: the shape of a start at a faint strength."""

