@@ -100,8 +100,12 @@ def rough_balance(
         signals = (force[1:-1], acceleration, velocity, position, *(other[1:-1] for other in others))
         f, a, v, q, *x = (smooth(s, window) for s in signals)
         if f.size > 20 and f.std() > 0 and v.std() > 0:
+            # At rest dry friction holds any force.
+            moves = _signs(v) != 0
+            f, a, v, q, *x = (s[moves] for s in (f, a, v, q, *x))
             weights = [w for y in x for w in (np.sin(y), np.cos(y))]
-            found.append(_one(f, a, v, None if of_velocity else q, rotary, weights))
+            if f.size > 20 and f.std() > 0:
+                found.append(_one(f, a, v, None if of_velocity else q, rotary, weights))
     if not found:
         return RoughBalance(0.0, 0.0, 0.0, 0.0)
     best = max(r.explained for r in found)

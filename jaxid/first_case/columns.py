@@ -12,6 +12,7 @@ from jaxid.errors import InputError
 from jaxid.first_case.words import FORCES, Meaning, meaning_of_joint
 from jaxid.logs.readers.dialect import split_unit
 from jaxid.logs.rough_inertia import correlation
+from jaxid.logs.units import fits, parse_unit
 
 # Sampling rate that a case states if the log has no time.
 NO_TIME_RATE = 1000.0
@@ -21,6 +22,8 @@ _SAME_COURSE, _SAME_SIZE = 0.95, 1.25
 _FOLLOWED = 0.5
 # Part of its peak below which a force without a sign comes at its least, if it is a magnitude.
 _NEAR_ZERO = 0.05
+# Most columns without a known meaning that are listed.
+_LISTED = 6
 # Order in which forces are chosen, with those that are only commanded after all that are measured.
 _RANK = {kind: k for k, kind in enumerate(FORCES)}
 
@@ -105,14 +108,26 @@ def columns_of(
                 "time" if name == time else "passed over" if meaning.quantity == "time" else meaning.quantity
             )
             meaning = replace(meaning, quantity=quantity)
+        unit = units.get(name, "") or meaning.unit or split_unit(name)[1]
+        if meaning.quantity in FORCES and not fits(parse_unit(unit), "force") and _of_motion(unit):
+            # The angle of a load is no load, and a command in degrees is a wanted position.
+            beside = ("load",) if meaning.quantity == "load" else ()
+            wanted = meaning.reference or meaning.quantity == "command"
+            meaning = replace(meaning, quantity="", reference=wanted, joint=(*meaning.joint, *beside))
         flat = values[:, 0]
         known = np.isfinite(flat)
         if np.count_nonzero(known) < 2:
             continue
         rows = np.arange(flat.size)
         filled = flat if known.all() else np.interp(rows, rows[known], flat[known])
-        out.append(Column(meaning, filled, units.get(name, "") or meaning.unit or split_unit(name)[1]))
+        out.append(Column(meaning, filled, unit))
     return out
+
+
+def _of_motion(unit: str) -> str:
+    """Return "position" or "velocity" if a unit is one of these; else an empty text."""
+    found = parse_unit(unit) if unit else None
+    return next((q for q in ("position", "velocity") if fits(found, q)), "")
 
 
 def choose(columns: Sequence[Column], where: str) -> Chosen:
@@ -133,6 +148,10 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
     position, spare = _by_joint(rest, "position")
     velocity, _ = _by_joint(rest, "velocity")
     if not position and not velocity:
+        rest = _named_by_unit(rest)
+        position, spare = _by_joint(rest, "position")
+        velocity, _ = _by_joint(rest, "velocity")
+    if not position and not velocity:
         position = _smoothest(rest, said, questions, where)
     joints = tuple(position or velocity)
     used = [*position.values(), *velocity.values()]
@@ -141,6 +160,7 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
     others = [c for c in others if not any(c is u for u in force.values())]
     reference = _references(others, position, spare, said, questions)
     velocity = _matched(velocity, joints)
+    said += _unused(rest, [*used, *force.values(), *reference.values()])
 
     return Chosen(
         time=time,
@@ -212,6 +232,26 @@ def _same_course(one: np.ndarray, other: np.ndarray) -> bool:
 def _roughness(values: np.ndarray) -> float:
     """Return the mean step from row to row over the standard deviation."""
     return float(np.std(np.diff(values)) / values.std()) if values.std() > 0 else np.inf
+
+
+def _unused(columns: Sequence[Column], used: Sequence[Column]) -> list[str]:
+    """Return a line on the columns that a case leaves out because their names say nothing."""
+    left = [c.name for c in columns if c.moves and not c.meaning.quantity and not any(c is u for u in used)]
+    if not left:
+        return []
+    more = f" and {len(left) - _LISTED} more" if len(left) > _LISTED else ""
+    listed = ", ".join(f"'{name}'" for name in left[:_LISTED])
+    return [f"not used, because no name says what they are: {listed}{more}"]
+
+
+def _named_by_unit(columns: Sequence[Column]) -> list[Column]:
+    """Return columns whose names say no quantity with that of their unit, if this is one of a motion."""
+    return [
+        c
+        if c.meaning.quantity or not _of_motion(c.unit)
+        else replace(c, meaning=replace(c.meaning, quantity=_of_motion(c.unit)))
+        for c in columns
+    ]
 
 
 def _smoothest(

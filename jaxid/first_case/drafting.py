@@ -244,6 +244,8 @@ class Draft:
             del section.keys["units"]
         if measures.unwrap:
             section.keys["unwrap"] = measures.unwrap
+        if measures.counts is not None:
+            section.keys["counts_per_revolution"] = measures.counts
         if self._raw.contents.episodes > 1:
             section.keys["episode"] = 0
             section.questions.append(
@@ -380,9 +382,15 @@ class Draft:
     def _count(self, column: Column) -> float:
         """Return the step between the positions of a column, in the unit of results; 0 if there is none."""
         step = position_levels(column.values)[1]
-        unit = self._measures.units.get("position")
-        found = None if unit is None else parse_unit(unit)
-        return step * (1.0 if found is None else found.factor)
+        return step * self._factor("position")
+
+    def _factor(self, quantity: str) -> float:
+        """Return the size of one unit of a column, in the unit of results."""
+        unit = parse_unit(self._measures.units.get(quantity, ""))
+        if unit is None:
+            return 1.0
+        counts = self._measures.counts
+        return unit.factor if unit.kind != "count" or counts is None else 2 * np.pi / counts
 
     # reading
 
@@ -416,17 +424,15 @@ class Draft:
     def _rate(self) -> float:
         """Return the usual rate of the log [Hz]."""
         assert self._chosen.time is not None, "the caller has seen it"
-        unit = parse_unit(self._measures.units.get("time", "s"))
         steps = np.diff(self._chosen.time.values)
-        return 1.0 / (float(np.median(steps[steps > 0])) * (1.0 if unit is None else unit.factor))
+        return 1.0 / (float(np.median(steps[steps > 0])) * self._factor("time"))
 
     def _by_hand(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return time, position or velocity, and force (zero if there is none), at even steps in SI units."""
-        chosen, measures = self._chosen, self._measures
+        chosen = self._chosen
 
         def scaled(column: Column, quantity: str) -> np.ndarray:
-            unit = parse_unit(measures.units.get(quantity, ""))
-            return column.values * (1.0 if unit is None else unit.factor)
+            return column.values * self._factor(quantity)
 
         motion = scaled(
             (chosen.position or chosen.velocity)[0], "position" if chosen.position else "velocity"

@@ -17,6 +17,8 @@ from jaxid.logs.wrap import find_wrap
 _TURNS_BEYOND, _FAST = 20.0, 10.0
 # Whole numbers over a wider span are counts.
 _COUNTS = 100.0
+# Counts after which a register starts anew, whatever a turn is.
+_REGISTER = 2**16
 _DEGREES = 180.0 / math.pi
 # Units of position and velocity by the ratio of a velocity to the slope of its position, all without units.
 _PAIRS = (
@@ -50,6 +52,7 @@ class Measures:
         units: `[log] units`, by quantity.
         labels: `[plant] units`, by quantity, where a quantity is not mechanical.
         unwrap: `[log] unwrap`; False: positions go on.
+        counts: `[log] counts_per_revolution`; None: not known, or positions are in another unit.
         said: Lines on everything that was assumed.
         questions: Doubts, by quantity.
     """
@@ -60,6 +63,7 @@ class Measures:
     unwrap: bool | float
     said: tuple[str, ...]
     questions: dict[str, str]
+    counts: int | None = None
 
 
 def measures_of(chosen: Chosen, robot: str = "") -> Measures:
@@ -86,7 +90,9 @@ def measures_of(chosen: Chosen, robot: str = "") -> Measures:
         said.append(f"the position starts anew after {turn}: unwrap")
         if not position and wrap.name in _BY_TURN:
             position = _BY_TURN[wrap.name]
-    counts = not position and bool(chosen.position) and _whole(chosen.position[0])
+    counts = bool(chosen.position) and _counted(chosen.position[0], position)
+    position = "" if counts else position
+    per_turn = round(wrap.turn) if counts and wrap is not None and round(wrap.turn) < _REGISTER else None
     if chosen.position and chosen.velocity and not counts and wrap is None:
         position, velocity = _by_slope(chosen, period, position, velocity, said)
     motion = "rotary"
@@ -95,7 +101,11 @@ def measures_of(chosen: Chosen, robot: str = "") -> Measures:
     elif not counts:
         motion = _motion(chosen, place, position or velocity, wrap is not None, said, questions)
 
-    if counts:
+    if per_turn is not None:
+        units["position"] = "count"
+        said.append(f"positions are encoder counts, {per_turn} a turn, after which they start anew")
+        questions["position"] = f"is a turn of the joint {per_turn} counts? Else counts_per_revolution"
+    elif counts:
         labels["position"] = "count"
         said.append("positions are whole numbers: encoder counts, which stay as they are")
         questions["position"] = (
@@ -115,7 +125,7 @@ def measures_of(chosen: Chosen, robot: str = "") -> Measures:
         _force(chosen, motion, units, labels, said, questions)
     if chosen.reference:
         own = _stated(chosen.reference[0], "position")
-        own = own or (units.get("position", "") if not counts else "")
+        own = "" if counts and per_turn is None else own or units.get("position", "")
         units |= {"reference": own} if own else {}
     return Measures(
         motion,
@@ -124,6 +134,7 @@ def measures_of(chosen: Chosen, robot: str = "") -> Measures:
         False if wrap is None else (True if wrap.name else wrap.turn),
         tuple(said),
         questions,
+        per_turn,
     )
 
 
@@ -165,7 +176,11 @@ def _time(time: Column | None, units: dict[str, str], said: list[str], questions
     return period * found.factor
 
 
-def _whole(column: Column) -> bool:
+def _counted(column: Column, unit: str) -> bool:
+    """Check whether positions are counts, as their unit says, or whole numbers without a unit."""
+    stated = parse_unit(unit) if unit else None
+    if stated is not None:
+        return stated.kind == "count"
     return bool(np.ptp(column.values) >= _COUNTS and np.all(column.values == np.round(column.values)))
 
 

@@ -55,7 +55,7 @@ ROTARY = frozenset("winkel drehwinkel angle theta phi drehzahl omega rpm dtheta 
 LINEAR = frozenset("weg hub displacement hoehe height distance".split())
 # Endings of a name that are units, as in position_mm or t_us.
 _UNITS = {
-    **{u: u for u in "s ms us ns mm um cm deg rad mrad rev rpm A mA V mV N kN Nm mNm counts".split()},
+    **{u: u for u in "s ms us ns mm um cm deg rad mrad rev rpm A mA V mV N kN Nm mNm lbf kgf counts".split()},
     "sec": "s",
     "degrees": "deg",
     "radps": "rad/s",

@@ -28,8 +28,11 @@ _ANGLES = {
     "arcsec": _DEGREE / 3600.0,
     "rev": _TURN,
 }
-_FORCES = {"N": 1.0, "kN": 1e3, "mN": 1e-3, "uN": 1e-6}
+_POUND, _OUNCE, _KILOPOND, _INCH = 4.4482216152605, 4.4482216152605 / 16, 9.80665, 0.0254
+_FORCES = {"N": 1.0, "kN": 1e3, "mN": 1e-3, "uN": 1e-6, "lbf": _POUND, "kgf": _KILOPOND}
 _TORQUES = {"N m": 1.0, "kN m": 1e3, "N cm": 1e-2, "N mm": 1e-3, "mN m": 1e-3, "uN m": 1e-6}
+_TORQUES |= {"lbf in": _POUND * _INCH, "lbf ft": _POUND * 12 * _INCH, "ozf in": _OUNCE * _INCH}
+_TORQUES |= {"kgf cm": _KILOPOND * 1e-2, "kgf m": _KILOPOND}
 _CURRENTS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "kA": 1e3}
 _VOLTAGES = {"V": 1.0, "mV": 1e-3, "kV": 1e3}
 _KINDS: dict[str, dict[str, float]] = {
@@ -77,6 +80,16 @@ _SPELT = {
     "percent": "%",
     "Nm": "N m",
     "mNm": "mN m",
+    "lbf-in": "lbf in",
+    "lbf-ft": "lbf ft",
+    "ozf-in": "ozf in",
+    "lb-in": "lbf in",
+    "in-lb": "lbf in",
+    "lb-ft": "lbf ft",
+    "ft-lb": "lbf ft",
+    "oz-in": "ozf in",
+    "kg-cm": "kgf cm",
+    "kgf-cm": "kgf cm",
     "kNm": "kN m",
     "Ncm": "N cm",
     "Nmm": "N mm",

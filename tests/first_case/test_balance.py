@@ -21,6 +21,19 @@ def test_an_axis_with_friction():
     assert rough_balance(-run["force"], run["position"], 1 / RATE, rotary=False).braked
 
 
+def test_an_axis_that_stands_still_most_of_the_time():
+    run = emps_like(0, duration=8.0).run()
+    part = slice(0, 5500)
+    q, force = run["position"][part], 35.15 * run["force"][part]
+    still = np.ones(20 * len(q))
+    # At rest friction holds what the integral of a controller has left: another force at each place.
+    position = np.concatenate([q[0] * still, q, q[-1] * still])
+    held = np.concatenate([-15.0 * still, force, 15.0 * still])
+    rough = rough_balance(held, position, 1 / RATE, rotary=False)
+    assert rough.inertia == pytest.approx(95.1, rel=0.25)
+    assert rough.spring is None
+
+
 def courses():
     t = np.arange(8000) / RATE
     q = sum(a * np.sin(w * t + p) for a, w, p in ((0.9, 2.0, 0.1), (0.4, 5.3, 1.0), (0.2, 9.1, 2.0)))

@@ -276,6 +276,43 @@ def test_an_export_of_a_twincat_scope(tmp_path):
     assert table["units"] == {"time": "ms"}
 
 
+def test_counts_that_start_anew_after_a_turn():
+    log = recorded()
+    # Of the recorded motion, three turns of an encoder whose header states its unit.
+    turns = 3.3 * (log["q"] - log["q"].min()) / np.ptp(log["q"])
+    counts = {"t [s]": log["t"], "enc [counts]": np.floor(4096 * turns) % 4096, "tau [Nm]": log["u"]}
+    first = jaxid.init(counts)
+    table = first.tables["log"]
+    assert table["counts_per_revolution"] == 4096
+    assert "is a turn of the joint 4096 counts? Else counts_per_revolution" in first.questions
+    read = jaxid.as_log(counts, first.case().columns)
+    np.testing.assert_allclose(read.position[:, 0], 2 * np.pi * turns, atol=2 * np.pi / 4096)
+    assert first.tables["sensor"]["position_resolution"] == pytest.approx(2 * np.pi / 4096)
+
+    # A counter of 16 bits starts anew after a turn of its own.
+    counts["enc [counts]"] = np.floor(65536 * turns) % 65536
+    assert jaxid.init(counts).tables["plant"]["units"]["position"] == "count"
+
+
+def test_columns_that_only_their_unit_names():
+    log = recorded()
+    servo = {"t": log["t"], "goal_deg": np.degrees(log["ref"]), "present_deg": np.degrees(log["q"])}
+    first = jaxid.init(servo)
+    table = first.tables["log"]
+    assert (table["reference"], table["position"]) == ("goal_deg", "present_deg")
+    assert "controller" in first.tables
+
+    two = {"t": log["t"], "motor_rad": log["q"], "load_rad": 0.9 * log["q"] ** 3, "torque": log["u"]}
+    with pytest.raises(InputError, match=r"2 joints move \('motor_rad', 'load_rad'\).*flexible_axis"):
+        jaxid.init(two)
+
+
+def test_a_column_that_is_left_out_is_said():
+    log = recorded()
+    first = jaxid.init({"t": log["t"], "angle": log["q"], "carriage": log["q"] ** 3, "torque": log["u"]})
+    assert any("no name says what they are: 'carriage'" in line for line in first.assumed)
+
+
 def test_what_is_refused(tmp_path, capsys):
     log = write_csv(tmp_path / "log.csv", signals())
     out = tmp_path / "case.toml"
