@@ -21,7 +21,7 @@ from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.in_loop.search import explore_within
 from jaxid.discovery.in_loop.unforced import explore_unforced
 from jaxid.discovery.noise import sensor_colour
-from jaxid.discovery.refit import in_simulation
+from jaxid.discovery.refit import Refitted, in_simulation
 from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.search import Search, Step
 from jaxid.discovery.separating.propose import Proposal, proposals
@@ -189,29 +189,32 @@ def _explore_forces(
     verdict = _verdict(effects, where, steps, search)
 
     progress("refitting in simulation" if refit else "simulating")
-    before, old = declared.result()
-    after, new = before, old
+    before = after = declared.result()
     if ahead is not None and search.model is not likely:
         ahead.cancel()
         ahead = None
     if effects:
-        after, new = ahead.result() if ahead else _with_effects(session, final, refit)
+        after = ahead.result() if ahead else _with_effects(session, final, refit)
     separating = _experiments(session, search, effects, experiments, progress)
 
-    found = Found(after, effects, where, _UNEXPLAINED if verdict == "unexplained" else "")
-    found = named_at_rest(found, session, search, steps, most, progress)
-    if found.estimate is not after:
+    # Friction at rest is sought beside the fit in the force domain, which no sample at rest has entered: a
+    # refit that counts them bends the other values around the missing friction.
+    moving = Found(after.in_force, effects, where, _UNEXPLAINED if verdict == "unexplained" else "")
+    found = named_at_rest(moving, session, search, steps, most, progress)
+    estimate, new = after.estimate, after.gaps
+    if found.estimate is not moving.estimate:
         progress("simulating")
-        verdict, new = "found", gaps(found.estimate.machine, session.runs)
+        verdict, estimate = "found", found.estimate
+        new = gaps(estimate.machine, session.runs)
     return Discovery(
         session=session,
         verdict=verdict,
         where=None if verdict == "nothing_missing" else found.where,
         effects=found.effects,
-        rounds=_as_refitted([_round(search, s) for s in steps], old, new, len(session.fits)),
-        before=before,
-        after=with_effort(found.estimate, session, new, searched=True),
-        gaps_before=old,
+        rounds=_as_refitted([_round(search, s) for s in steps], before.gaps, new, len(session.fits)),
+        before=before.estimate,
+        after=with_effort(estimate, session, new, searched=True),
+        gaps_before=before.gaps,
         gaps_after=new,
         noise_floor=search.floor,
         proposals=separating,
@@ -359,14 +362,12 @@ def start_search(
     return baseline, search
 
 
-def _with_effects(session: Session, final: Machine, refit: bool) -> tuple[Estimate, tuple[Gap, ...]]:
-    """Fit the machine with the effects that were added, and return the fit and its gaps."""
+def _with_effects(session: Session, final: Machine, refit: bool) -> Refitted:
+    """Fit the machine with the effects that were added."""
     return _as_bodies_in_simulation(session, _of_force(session.with_machine(final)), refit)
 
 
-def _as_bodies_in_simulation(
-    session: Session, start: Estimate, refit: bool
-) -> tuple[Estimate, tuple[Gap, ...]]:
+def _as_bodies_in_simulation(session: Session, start: Estimate, refit: bool) -> Refitted:
     """Run `in_simulation`, links being those of real bodies if the case asks for that.
 
     The search goes without: what an effect explains hardly depends on it.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,22 @@ from jaxid.simulation.step_size import TooStiffError
 _WORSE = 1.5
 
 
-def in_simulation(session: Session, start: Estimate, refit: bool) -> tuple[Estimate, tuple[Gap, ...]]:
+@dataclass(frozen=True)
+class Refitted:
+    """A fit in the force domain, and what a refit in simulation made of it.
+
+    Args:
+        in_force: Fit in the force domain.
+        estimate: Fit that is kept: the refit, or the former.
+        gaps: Gaps of the latter, by log.
+    """
+
+    in_force: Estimate
+    estimate: Estimate
+    gaps: tuple[Gap, ...]
+
+
+def in_simulation(session: Session, start: Estimate, refit: bool) -> Refitted:
     """Refit a model in simulation if that is wanted, and compute its gaps.
 
     Args:
@@ -33,12 +48,12 @@ def in_simulation(session: Session, start: Estimate, refit: bool) -> tuple[Estim
         refit: Whether it is refitted; if not, the estimate is `start`.
 
     Returns:
-        The estimate, and its gap on each log.
+        Both fits, and the gap of the one that is kept on each log.
     """
     estimate = refit_of(session.with_machine(start.machine), start) if refit else start
     if start.machine.parameters.bodies:
         estimate = linked(estimate, session)
-    return estimate, gaps(estimate.machine, session.runs)
+    return Refitted(start, estimate, gaps(estimate.machine, session.runs))
 
 
 def refit_of(session: Session, start: Estimate) -> Estimate:

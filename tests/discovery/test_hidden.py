@@ -81,3 +81,11 @@ def test_a_limit_that_acts_in_few_moments_is_named(tmp_path):
     case = next(c for c in cases("test") if c.seed == 8159)
     record = searched(case, tmp_path)
     assert record["named"] == ["saturation"], said(record)
+
+
+@pytest.mark.slow
+def test_a_refit_does_not_hide_friction_at_rest(tmp_path):
+    """The refit of the declared model counted the starts from rest, and bent its values around them."""
+    case = next(c for c in cases("fresh") if c.seed == 12019)
+    record = run_case(case, tmp_path, refit=True)
+    assert judge.strictly_right(record), said(record)
