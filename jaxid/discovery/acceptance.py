@@ -30,6 +30,10 @@ _RARELY = 1e-3
 # by which the gap closes on the fitted log.
 _CONFIRMED = 0.1
 
+# A mass of the machine, or another positive parameter of its plant, is next to nothing below this part of its
+# value without an effect.
+_NOTHING = 0.05
+
 
 @dataclass
 class Acceptance:
@@ -203,6 +207,10 @@ class Acceptance:
             if np.isfinite(free[i].upper) and new[i] >= (1 - 1e-3) * free[i].upper:
                 return f"{free[i].name} runs to its limit, at which the effect only imitates another"
 
+        lost = self._lost_mass(old, new)
+        if lost:
+            return f"{lost} would be next to nothing beside it, as if only signs of the force had to agree"
+
         e = self.residual(new)
         if self._sum(e) < self._least(fitted) * self.noise:
             return "it removes more than the sensors' noise allows"
@@ -214,6 +222,20 @@ class Acceptance:
         if validation is not None and confirmed is not None:  # both or neither
             if validation < TIE_NATS or confirmed < _CONFIRMED * closed:
                 return "it does not help on the validation log"
+        return ""
+
+    def _lost_mass(self, old: np.ndarray, new: np.ndarray) -> str:
+        """Return the name of a parameter of the plant, positive by physics, that an effect takes away.
+
+        Along motions at even speeds a limit of the drive that equals dry friction leaves sign(u) against
+        sign(v), which agree, and no inertia.
+
+        Args:
+            old, new: All unknowns, without and with the added effects.
+        """
+        for f, before, after in zip(self.superset.machine.parameters.free, old, new, strict=True):
+            if f.effect is None and f.sign == "positive" and after < _NOTHING * before:
+                return f.name
         return ""
 
     def _least(self, fitted: int) -> float:

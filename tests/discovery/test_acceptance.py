@@ -165,6 +165,21 @@ def test_what_takes_the_sensors_own_noise_away_is_turned_down(axis):
     assert why == "it removes more than the sensors' noise allows"
 
 
+def test_a_limit_that_leaves_no_inertia_is_turned_down(axis):
+    """A drive at its limit, which friction balances: sign(u) equals sign(v) along even motions."""
+    _, search = axis
+    names = search.superset.machine.parameters.names
+    index = next(c for c in search.superset.candidates if c.kind == "saturation").index
+    off = with_values(search, "constant_force", 10.0)
+    assert (
+        search.acceptance.objection(index, off, with_values(search, "saturation", 1e3), None, None, 4) == ""
+    )
+    light = with_values(search, "saturation", 1e3)
+    light[names.index("inertia")] *= 0.02
+    why = search.acceptance.objection(index, off, light, None, None, 4)
+    assert why.startswith("inertia would be next to nothing beside it")
+
+
 def test_a_joint_with_little_noise_counts_for_little():
     """Weighted sums of squares: what a true model leaves seldom, of a loud joint and a quiet one."""
     floors, counts = np.array([1.0, 0.1]), np.array([20, 20])

@@ -1,5 +1,7 @@
 """Break-away friction read off starts from rest, on logs of an independent simulator."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,22 @@ def test_nothing_is_seen_where_there_is_none(name, seed, tmp_path):
     assert b.count >= 3
     assert b.evidence < b.threshold
     assert not b.holds
+
+
+def test_noise_of_the_force_is_no_break_away(tmp_path, monkeypatch):
+    """The simulation of a start leaves at the first noisy reading above the level, the machine later."""
+    setup = machines.emps_like(0, 1.0, 16.0)
+    text = case_text(setup, [*setup.machine.effects.items()], closed=False)
+    log = log_of(setup)
+    noise = 2.0 / setup.machine.actuator_gain * np.random.default_rng(1).standard_normal(log.force.shape)
+    noisy = replace(log, force=log.force + noise)
+    session = open_session(write_case(tmp_path, text), noisy, align_hold=True)
+    estimate = inverse_dynamics(session.machine, session.fit.data)
+    # As if the log had more starts: with these the evidence is 1.9 nats.
+    monkeypatch.setattr("jaxid.discovery.at_rest.break_away._FALSE_POSITIVE", 0.5)
+    b = break_away(estimate, session.runs)[0]
+    assert isinstance(b, str), f"{b.level} N at {b.evidence} nats"
+    assert b.startswith("noise of the logged force, which reaches")
 
 
 def test_a_log_without_a_start_from_rest_says_nothing(tmp_path):

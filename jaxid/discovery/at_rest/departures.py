@@ -38,6 +38,8 @@ _MOST = 192
 # noise, or this part of its RMS.
 _SAME = 1.5
 _NEARLY = 0.02
+# Median of the square of a standard normal variable.
+_MEDIAN_OF_SQUARE = 0.4549
 
 
 class Starts(eqx.Module):
@@ -103,7 +105,7 @@ def starts_from_rest(
     logs = [
         (
             _internal_states(machine.plant, ForceData.of(r.data)),
-            replace(r.log, force=_applied_command(r.machine(machine), r.log)),
+            replace(r.log, force=_applied_command(r.machine(machine), r.log)[0]),
             r.data,
         )
         for r in runs
@@ -205,15 +207,38 @@ def _internal_states(plant: Plant, data: ForceData) -> tuple:
     return integrate_internal_states(plant, data.q, data.qd, data.qdd, u, data.period, data.start)
 
 
-def _applied_command(machine: Machine, log: Log) -> np.ndarray:
-    """Return the command without the noise of the log, as the controller computes it from the readings.
+def force_noise_at_rest(machine: Machine, log: Log, starts: Starts, joint: int) -> float:
+    """Return the standard deviation of the noise of the force under which a joint starts [N or N m].
+
+    It is that of second differences of the readings at rest, in which friction holds and the force changes
+    slowly. A command that the declared law computes has none.
+
+    Args:
+        machine: The machine.
+        log: A log of the starts.
+        starts: The starts, whose commands are in units of the log.
+        joint: Index of the joint that starts.
+    """
+    driven = machine.plant.driven(log.position.shape[1])
+    drives = np.flatnonzero(np.asarray(driven) == joint)
+    if not drives.size or _applied_command(machine, log)[1][drives[0]]:
+        return 0.0
+    readings = np.asarray(starts.command)[:, : int(starts.still), drives[0]]
+    curved = np.diff(readings, n=2, axis=1)
+    # Of white noise a second difference has six times the variance.
+    variance = np.median(curved**2) / _MEDIAN_OF_SQUARE / 6
+    return float(np.sqrt(variance) * abs(np.asarray(machine.gain)[drives[0]]))
+
+
+def _applied_command(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Return the command without the noise of the log, and whether the law gives it, by drive.
 
     A single noisy sample above the level at a start would set the simulation in motion. The logged command is
     returned if there is no controller, or one that does not reproduce it.
     """
     law = machine.law
     if law is None or log.reference is None:
-        return log.force
+        return log.force, np.zeros(log.force.shape[1], bool)
     extra = disturbance_at(machine.disturbance, log.time, log)
     arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
     driven = machine.plant.driven(log.position.shape[1])
@@ -222,4 +247,5 @@ def _applied_command(machine: Machine, log: Log) -> np.ndarray:
     stated = machine.sensor.force_noise
     noise = 0.0 if stated is None else np.asarray(stated)
     off = np.sqrt(np.mean((made - log.force) ** 2, axis=0))
-    return np.where(off <= np.maximum(_SAME * noise, _NEARLY * size), made, log.force)
+    same = off <= np.maximum(_SAME * noise, _NEARLY * size)
+    return np.where(same, made, log.force), same
