@@ -39,6 +39,8 @@ _NEARLY_ALL = 0.95
 # that white noise exceeds once in 10^8.
 _LINE_PART = 0.05
 _LINE_FACTOR = 25.0
+# Most intervals of time that are listed in words.
+_LISTED = 3
 
 
 @dataclass(frozen=True)
@@ -242,6 +244,13 @@ def _best(gains: dict[str, float], clean: str) -> str:
     return other if gains[other] > _FAR_MORE * max(gains[clean], 0.0) else clean
 
 
+def _in_words(intervals: tuple[tuple[float, float], ...]) -> str:
+    """Return intervals of time in words, the first few of many."""
+    spans = [f"from {start:.4g} to {end:.4g} s" for start, end in intervals[:_LISTED]]
+    more = len(intervals) - len(spans)
+    return ", ".join(spans) + (f", and in {more} more intervals of time" if more else "")
+
+
 def _describe(
     e: np.ndarray,
     counts: np.ndarray,
@@ -274,7 +283,7 @@ def _describe(
             f"joint {joint + 1}: the residual has a spectral line at {line:.3g} Hz that the reference lacks"
         )
     elif name == "time" and intervals:
-        text = f"joint {joint + 1}: the residual is loud in {len(intervals)} interval(s) of time"
+        text = f"joint {joint + 1}: the residual is loud {_in_words(intervals)}"
     return Where(
         joint=joint + 1,
         variable=name,

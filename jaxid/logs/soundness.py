@@ -177,7 +177,14 @@ def _force(log: Log, limit: ByJoint | None, path: str, free: bool) -> list[Findi
             hint = "check the column; this joint is driven by the others alone"
             findings.append(Finding("warning", f"constant at {u[0]:.6g}", where, hint))
         else:
-            findings += _saturation(u, bound, where)
+            found = _saturation(u, bound, where)
+            step = _step(u) if bound is None else None
+            if found and step is not None:
+                first = log.rows[0] + step
+                what = f"the force is one step, from {u[0]:.6g} to {u[-1]:.6g}"
+                hint = f"select the rows behind it: rows = [{first}, {log.rows[0] + u.size}] in [log]"
+                found = [Finding(found[0].severity, what, where, hint)]
+            findings += found
     return findings
 
 
@@ -190,6 +197,12 @@ def _transient(log: Log) -> bool:
     one_way = np.abs(np.sum(np.sign(speeds) * (np.abs(speeds) > 0.05 * fastest), axis=0))
     turns = one_way < np.sum(np.abs(speeds) > 0.05 * fastest, axis=0)
     return bool(np.any((np.ptp(speeds, axis=0) > _CHANGES * fastest) & ~turns))
+
+
+def _step(u: np.ndarray) -> int | None:
+    """Return the row at which a force of two levels and one step changes; None of others."""
+    steps = np.flatnonzero(np.diff(u))
+    return int(steps[0]) + 1 if steps.size == 1 else None
 
 
 def _saturation(u: np.ndarray, bound: float | None, where: str) -> list[Finding]:

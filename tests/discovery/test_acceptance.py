@@ -13,7 +13,7 @@ from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
 from jaxid.discovery.screen import has_influence
 from jaxid.discovery.search import Model
-from jaxid.discovery.where import _bin_offset, _loud
+from jaxid.discovery.where import _bin_offset, _in_words, _loud
 from jaxid.effects.actuator import Saturation
 from jaxid.gap import noise_density
 from jaxid.model.effect import Scales
@@ -253,6 +253,8 @@ def test_a_joint_that_moves_in_short_spells_has_no_loud_interval():
     steady[40:60] *= 20.0
     [(start, end)] = _loud(steady, np.ones(400, bool), data)
     assert start < 0.25 < end < 0.5
+    assert _in_words(((start, end),)) == f"from {start:.4g} to {end:.4g} s"
+    assert _in_words(((0.0, 1.0),) * 5).endswith("from 0 to 1 s, and in 2 more intervals of time")
 
 
 def test_a_limit_that_no_sample_reaches_has_no_influence(tmp_path):

@@ -107,6 +107,13 @@ def test_saturation():
     assert not [f for f in check_log(clipped) if "saturated" in f.what], "a limit nobody gave"
 
 
+def test_a_step_from_rest_is_no_saturation():
+    """A trace begins before its step; behind it the force is constant, which a transient may have."""
+    step = np.where(np.arange(4000) < 300, 0.0, 0.35)
+    fault = found(axis_log(force=step), "error", "the force is one step, from 0 to 0.35")
+    assert fault.hint == "select the rows behind it: rows = [300, 4000] in [log]"
+
+
 def test_a_binary_excitation_is_no_saturation():
     bits = np.where(np.random.default_rng(0).random(4000) > 0.5, 2.0, -2.0)
     assert all(f.severity == "warning" for f in check_log(axis_log(force=bits)))
