@@ -1,13 +1,16 @@
 """The search of an arm of servos joint by joint; logs by the exact stepper, without a force."""
 
 import json
+from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import jaxid
-from jaxid.discovery.in_loop.by_joint import explore_by_joint, joint_words
+from jaxid.discovery.in_loop import unforced
+from jaxid.discovery.in_loop.by_joint import ArmSearch, explore_by_joint, joint_words
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.estimators.apart.joint import joints_alone
@@ -93,6 +96,45 @@ def test_commands_that_rest_are_refused_in_one_line():
     session = replace(session, fit=replace(session.fit, log=log))
     with pytest.raises(InputError, match="no joint's command moves"):
         explore_by_joint(session, max_effects=5, progress=lambda text: None)
+
+
+def loaded(session, force: float):
+    """The session of the first joint, whose links push with a force at every tick."""
+    alone = joints_alone(session.machine, parts_of(session))[0]
+    (part,) = alone.parts
+    load = np.full((part.log.samples, 1), force)
+    part = replace(part, machine=replace(part.machine, held_load=load))
+    return replace(alone, parts=(part,)), session_of_joint(session, replace(alone, parts=(part,)))
+
+
+def test_what_was_found_is_refitted_under_the_load_of_the_links(monkeypatch):
+    """The machine of a search is that of a fit, which has no load of its own."""
+    _, own = loaded(open_session(servo_arm_case(dry()), still()), 7.0)
+    seen = []
+
+    def fitted(machine, log, start, **options):
+        seen.append(machine.held_load)
+        yield from ()
+        return "fit"
+
+    monkeypatch.setattr(unforced, "fitted_with_noise", fitted)
+    bare = replace(own.machine, load=None, held_load=None)
+    assert unforced.refitted(own, bare, None) == "fit"
+    assert np.all(seen[0] == 7.0)
+
+
+def test_a_joint_is_searched_again_only_if_other_loads_move_it(monkeypatch):
+    session = open_session(servo_arm_case(dry()) | {"sensor": {"position_noise": 2e-4}}, still())
+    alone, own = loaded(session, 0.0)
+    fit = SimpleNamespace(machine=own.machine, theta=own.machine.parameters.guess, residual=np.ones(3))
+    search = SimpleNamespace(session=own, after=fit, effects=(), kinds=[])
+    arm = ArmSearch(session, parts_of(session), [alone], {0: fit})
+    for force, again in ((0.0, []), (1e-4, []), (0.5, [0])):
+        other, _ = loaded(session, force)
+        monkeypatch.setattr(ArmSearch, "_with_loads", lambda self, joints, found, other=other: [other])
+        assert arm.waiting({}, Counter()) == [0]
+        assert arm.waiting({0: search}, Counter({0: 1})) == again
+        assert arm.waiting({0: search}, Counter({0: 3})) == []
 
 
 def test_joints_go_by_number_and_by_name():

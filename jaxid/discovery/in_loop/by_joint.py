@@ -8,6 +8,7 @@ is put together on the arm.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,7 +20,6 @@ from jaxid.discovery.in_loop.unforced import (
     UNSEEN,
     explored_from,
     open_joints,
-    refitted,
     verdict_without_effects,
     where_in_time,
 )
@@ -29,11 +29,12 @@ from jaxid.errors import InputError
 from jaxid.estimators.apart.joint import JointAlone, joints_alone
 from jaxid.estimators.apart.loads import with_simulated_loads
 from jaxid.estimators.apart.session import session_of_joint
-from jaxid.estimators.apart.steps import joint_fits, of_arm
+from jaxid.estimators.apart.steps import common_numerics, joint_fits, of_arm, side_by_side
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import Part, part_of, parts_of
-from jaxid.gap import gaps
+from jaxid.gap import gaps, simulation_of_log
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
 from jaxid.model.unknowns import free_effect, label
@@ -41,8 +42,11 @@ from jaxid.numerics.lanes import run_alone
 from jaxid.session import Session
 from jaxid.simulation.sensor_noise import position_noise
 
-# Number of times that the loads are renewed before a search and after it: fits and loads come closer.
-_RENEWALS = 2
+# Most renewals of loads and fits before a search and after it.
+_RENEWALS = 6
+# Most searches of one joint, and the change by which other loads call for one, or a gain for another renewal
+# [nats]: a third of what counts as visible in the benchmarks.
+_SEARCHES, _NEWS = 3, 10.0
 
 
 def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
@@ -59,16 +63,20 @@ def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[
     progress("fitting the declared model, joint by joint")
     arm = ArmSearch.of(session)
     found: dict[int, Discovery] = {}
-    # What is found at one joint changes the forces on the others: the joint that leaves most is the first.
-    while left := [joint for joint in arm.by_excess if joint not in found]:
-        joint, number = left[0], len(found) + 1
+    # What is found at one joint changes the forces on the others: the joint that leaves most is the first,
+    # and a joint that these forces move by more than noise is searched again.
+    searches = Counter[int]()
+    while left := arm.waiting(found, searches):
+        joint, before = left[0], found.get(left[0])
+        number = f"again, {joint + 1}" if before else f"{len(found) + 1}"
         at_joint = _prefixed(progress, f"{joint_words(session, joint)} ({number} of {len(arm.declared)})")
+        if before:
+            arm = arm.reopened(joint, found)
+        searches[joint] += 1
         found[joint] = arm.searched(joint, max_effects=max_effects, progress=at_joint)
-        if found[joint].effects:
+        if found[joint].kinds != ([] if before is None else before.kinds):
             at_joint("simulating the arm with what was found")
-            for _ in range(_RENEWALS):
-                found = arm.refined(found)
-                arm = arm.renewed(found)
+            arm, found = arm.settled(found)
     progress("simulating the whole arm")
     return arm.together({joint: found[joint] for joint in sorted(found)})
 
@@ -105,9 +113,7 @@ class ArmSearch:
             raise InputError("no joint's command moves in the logs", where=session.case.where, hint=hint)
         fits = _fitted(session, moving)
         arm = cls(session, parts, every, {a.joint: fit for a, fit in zip(moving, fits, strict=True)})
-        for _ in range(_RENEWALS):
-            arm = arm.renewed({})
-        return arm
+        return arm.settled({})[0]
 
     @property
     def by_excess(self) -> list[int]:
@@ -123,37 +129,75 @@ class ArmSearch:
     def _alone(self, joint: int) -> JointAlone:
         return next(alone for alone in self.every if alone.joint == joint)
 
-    def renewed(self, found: Mapping[int, Discovery]) -> ArmSearch:
-        """Return the arm with the loads of its simulation, and refits of joints to which these come closer.
+    def settled(self, found: Mapping[int, Discovery]) -> tuple[ArmSearch, dict[int, Discovery]]:
+        """Return the arm and its searches with fits and loads renewed until they gain next to nothing.
 
         Args:
-            found: Joints that were searched, which keep their fits.
+            found: Search of each joint that was searched.
         """
-        open_ones = [a for a in self.every if a.joint in self.declared and a.joint not in found]
-        if not open_ones:
-            return self
-        begun = [a.with_estimate(self.declared[a.joint].theta) for a in open_ones]
-        tried = self._with_loads(begun, found)
-        fits = dict(zip([a.joint for a in tried], _fitted(self.session, tried), strict=True))
-        better = {a.joint: a for a in tried if _squares(fits[a.joint]) < _squares(self.declared[a.joint])}
-        declared = {j: fits[j] if j in better else fit for j, fit in self.declared.items()}
-        return replace(self, every=[better.get(a.joint, a) for a in self.every], declared=declared)
+        arm, out = self, dict(found)
+        for _ in range(_RENEWALS):
+            arm, out, gained = arm.renewed(out)
+            if gained < _NEWS:
+                break
+        return arm, out
 
-    def refined(self, found: Mapping[int, Discovery]) -> dict[int, Discovery]:
-        """Return searches whose models are refitted with the loads of the arm that was found, if they gain.
+    def renewed(self, found: Mapping[int, Discovery]) -> tuple[ArmSearch, dict[int, Discovery], float]:
+        """Return the arm with the loads of its simulation, and refits of the joints that gain by them.
 
         Args:
-            found: Search of each joint.
+            found: Search of each joint that was searched, whose effects are refitted.
+
+        Returns:
+            The arm, the searches, and the gain in log-likelihood [nats].
         """
         machine, names = _with_effects(self.session.machine, found)
-        joints = [_fuller(alone, machine, found, names) for alone in self.every if alone.joint in found]
-        out = dict(found)
-        for alone in self._with_loads(joints, found):
-            own, d = session_of_joint(self.session, alone), found[alone.joint]
-            fit = refitted(own, own.machine, None)
-            if _squares(fit) < _squares(d.after):
-                out[alone.joint] = replace(d, after=fit)
-        return out
+        known = {**self.declared, **{joint: d.after for joint, d in found.items()}}
+        joints = [
+            _fuller(alone, machine, found, names).with_estimate(known[alone.joint].theta)
+            for alone in self.every
+            if alone.joint in known
+        ]
+        tried = self._with_loads(joints, found)
+        gained, every = 0.0, {alone.joint: alone for alone in self.every}
+        declared, out = dict(self.declared), dict(found)
+        for alone, fit in zip(tried, _refitted(self.session, tried), strict=True):
+            joint, old, new = alone.joint, _squares(known[alone.joint]), _squares(fit)
+            if not new < old:
+                continue
+            gained += 0.5 * fit.residual.size * float(np.log(old / max(new, 1e-300)))
+            if joint in found:
+                out[joint] = replace(found[joint], after=fit)
+            else:
+                declared[joint], every[joint] = fit, alone
+        return replace(self, every=list(every.values()), declared=declared), out, gained
+
+    def waiting(self, found: Mapping[int, Discovery], searches: Mapping[int, int]) -> list[int]:
+        """Return the joints to search: those that were not, and then those whose loads were others.
+
+        Args:
+            found: Search of each joint that was searched.
+            searches: How often each joint was searched.
+        """
+        new = [joint for joint in self.by_excess if joint not in found]
+        again = [joint for joint in self.by_excess if searches[joint] < _SEARCHES]
+        if new or not again:
+            return new
+        now = self._with_loads([self._alone(joint) for joint in again], found)
+        return [j for j, alone in zip(again, now, strict=True) if _moved(found[j], alone) > _NEWS]
+
+    def reopened(self, joint: int, found: Mapping[int, Discovery]) -> ArmSearch:
+        """Return the arm with a fit of the declared model of a joint under the loads of what was found.
+
+        Args:
+            joint: Its number, from 0.
+            found: Search of each joint, with that of this one.
+        """
+        begun = self._alone(joint).with_estimate(self.declared[joint].theta)
+        (alone,) = self._with_loads([begun], found)
+        (fit,) = _fitted(self.session, [alone])
+        every = [alone if a.joint == joint else a for a in self.every]
+        return replace(self, every=every, declared={**self.declared, joint: fit})
 
     def _with_loads(self, joints: Sequence[JointAlone], found: Mapping[int, Discovery]) -> list[JointAlone]:
         """Return joints with the loads of the simulated arm, with what was found at some of its joints."""
@@ -174,7 +218,10 @@ class ArmSearch:
         """
         alone, before = self._alone(joint), self.declared[joint]
         own = session_of_joint(self.session, alone.with_estimate(before.theta))
-        return explored_from(own, before, max_effects=max_effects, progress=progress, effort=FEW)
+        # The arm as a whole is judged at the end.
+        return explored_from(
+            own, before, max_effects=max_effects, progress=progress, effort=FEW, judged=False
+        )
 
     def together(self, found: Mapping[int, Discovery]) -> Discovery:
         """Return what was found at the joints as the discovery of the arm, simulated as a whole.
@@ -224,6 +271,43 @@ def _fitted(session: Session, joints: Sequence[JointAlone]) -> list[Estimate]:
     return run_alone(joint_fits(joints, minimiser=stated.minimiser, hessian=demands.hessian))
 
 
+def _refitted(session: Session, joints: Sequence[JointAlone]) -> list[Estimate]:
+    """Return the fits of joints from their values, each alone."""
+    demands = session.case.identification
+    numerics = common_numerics(joints)
+    fits = [
+        output_error_steps(
+            alone.machine,
+            alone.parts,
+            start=alone.machine.parameters.guess,
+            numerics=numerics,
+            minimiser=session.case.output_error.minimiser,
+            hessian=demands.hessian,
+        )
+        for alone in joints
+    ]
+    return run_alone(side_by_side(fits))
+
+
+def _moved(found: Discovery, alone: JointAlone) -> float:
+    """Return half of the squares by which loads move a joint with what was found, over its noise [nats].
+
+    Args:
+        found: Its search, which had other loads.
+        alone: The joint with the loads.
+    """
+    total = 0.0
+    for run, part in zip(found.session.fits, alone.parts, strict=True):
+        machine = run.machine(found.after.machine)
+        loaded = replace(machine, load=part.machine.load, held_load=part.machine.held_load)
+        before, after = (simulation_of_log(m, run.log) for m in (machine, loaded))
+        if before is None or after is None:
+            return np.inf
+        change = (after.position - before.position) / position_noise(machine, run.log)
+        total += 0.5 * float(np.sum(np.square(change)))
+    return total if np.isfinite(total) else np.inf
+
+
 def _squares(fit: Estimate) -> float:
     """Return the squared residual of a fit; infinite if it diverged."""
     total = float(np.sum(np.square(fit.residual)))
@@ -269,9 +353,14 @@ def _fuller(
     """Return a joint with the unknowns that its search added."""
     if alone.joint not in found:
         return alone
+    machine = found[alone.joint].after.machine
     added = [final.parameters.names.index(name) for some in names[alone.joint] for name in some]
     index = np.concatenate([alone.index, np.array(added, int)])
-    return replace(alone, machine=found[alone.joint].after.machine, index=index)
+    session = found[alone.joint].session
+    parts, others = (
+        tuple(part_of(run, machine) for run in some) for some in (session.fits, session.validations)
+    )
+    return replace(alone, machine=machine, parts=parts, others=others, index=index)
 
 
 def _verdict(verdicts: Sequence[str]) -> str:

@@ -80,6 +80,7 @@ def explored_from(
     max_effects: int,
     progress: Callable[[str], None],
     effort: Effort = MANY,
+    judged: bool = True,
 ) -> Discovery:
     """Search logs without a force from a fit of the declared model.
 
@@ -88,6 +89,8 @@ def explored_from(
         before: The fit.
         max_effects, progress: See `explore_unforced`.
         effort: Number of starts far from the fits of incomplete models.
+        judged: Whether what a search without effects leaves is compared with noise; if not, its verdict says
+            that nothing is missing.
 
     Raises:
         InputError: If the loop cannot be simulated.
@@ -107,7 +110,7 @@ def explored_from(
     new = gaps(after.machine, session.runs) if effects else old
     verdict = "found"
     if not effects:
-        verdict = verdict_without_effects(bool(open_joints(session, before.machine, old)))
+        verdict = verdict_without_effects(judged and bool(open_joints(session, before.machine, old)))
     return Discovery(
         session=session,
         verdict=verdict,
@@ -278,6 +281,8 @@ def refitted(session: Session, final: Machine, base: int | None) -> Estimate:
     options: dict[str, Any] = {"minimiser": stated.minimiser, "hessian": demands.hessian}
     held = None
     if not session.more:
+        # A joint of an arm has the load of its links along the log.
+        final = session.fit.machine(final)
         held = run_alone(fitted_with_noise(final, session.fit.log, final.parameters.guess, **options))
     if held is None:
         fitted = parts_of(session.with_machine(final)) if session.more else session.fit.log
