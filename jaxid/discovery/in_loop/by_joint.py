@@ -161,7 +161,10 @@ class ArmSearch:
         tried = self._with_loads(joints, found)
         gained, every = 0.0, {alone.joint: alone for alone in self.every}
         declared, out = dict(self.declared), dict(found)
-        for alone, fit in zip(tried, _refitted(self.session, tried), strict=True):
+        # A declared model that lacks less now may fit best in another valley: it starts anew.
+        parted = [[a for a in tried if (a.joint in found) is done] for done in (False, True)]
+        fits = [*_fitted(self.session, parted[0]), *_refitted(self.session, parted[1])]
+        for alone, fit in zip([*parted[0], *parted[1]], fits, strict=True):
             joint, old, new = alone.joint, _squares(known[alone.joint]), _squares(fit)
             if not new < old:
                 continue
