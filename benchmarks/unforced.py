@@ -66,7 +66,7 @@ def covered(drawn: Servo) -> dict[str, Any]:
 def searched(drawn: Servo | Arm) -> dict[str, Any]:
     """Search a case for what it does not declare; return what was named, and what an oracle sees."""
     sees = drawn.evidence() if drawn.hidden else None
-    begin = time.perf_counter()
+    begin, busy = time.perf_counter(), time.process_time()
     found = jaxid.discover(drawn.case(), drawn.columns())
     return {
         "verdict": found.verdict,
@@ -77,6 +77,7 @@ def searched(drawn: Servo | Arm) -> dict[str, Any]:
         "evidence": [e.score.evidence for e in found.effects],
         "oracle": sees,
         "search_seconds": time.perf_counter() - begin,
+        "search_cpu_seconds": time.process_time() - busy,
     }
 
 

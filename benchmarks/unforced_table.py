@@ -113,4 +113,7 @@ def _nulls(runs: Sequence[Record]) -> Iterator[str]:
 def _pace(runs: Sequence[Record]) -> Iterator[str]:
     seconds = [r["search_seconds"] for r in runs if "search_seconds" in r]
     if seconds:
-        yield f"A search takes {np.median(seconds):.0f} s (median), {np.max(seconds):.0f} s at most."
+        busy = [r["search_cpu_seconds"] for r in runs if "search_cpu_seconds" in r]
+        of_cores = f"; {np.median(busy):.0f} s of a core's time (median of {len(busy)})" if busy else ""
+        clock = f"{np.median(seconds):.0f} s (median), {np.max(seconds):.0f} s at most"
+        yield f"A search takes {clock}{of_cores}."

@@ -29,6 +29,8 @@ from jaxid.simulation.replay import Replay, from_rest
 # Pairs of opposite noise in the mean that a fit follows, and in the mean readings at one point that its shift
 # gives; fewer in a long log: the ticks of all runs together are limited.
 _PAIRS, _MANY_PAIRS, _FEWEST_PAIRS, _TICKS = 8, 128, 4, 2_000_000
+# Pairs by which levels of noise are compared, all under the same draws, and that are run together.
+_FEW_PAIRS = 32
 # Draws that are run together, for memory.
 _TOGETHER = 50
 # Noise before rounding that is tried if the case does not state it, as parts of a count, or of the noise that
@@ -168,7 +170,7 @@ def estimated_noise(
     if known is not None:
         levels = [np.broadcast_to(np.asarray(known), n) * measured]
     replay = replay.following(machine.parameters.places, jnp.asarray(machine.parameters.guess))
-    loop = _Loop(machine.plant, log, replay, _opposite(replay, _MANY_PAIRS))
+    loop = _Loop.of(machine.plant, log, replay)
     begun = [ReadingNoise(count, levels[0], np.zeros(2 * n), rest, follows=follows) for rest in (False, True)]
     noises = [loop.started(loop.at_best_level(noise, levels)) for noise in begun]
     noise = min(noises, key=lambda noise: float(np.sum(loop.squares(noise))))
@@ -185,21 +187,33 @@ class _Loop:
         plant: The plant.
         log: The log.
         replay: The loop without noise.
-        draws: Standard normal numbers, (draws, ticks, n).
+        draws: Sets of standard normal numbers, (draws, ticks, n) each.
     """
 
     plant: Plant
     log: Log
     replay: Replay
-    draws: Float[np.ndarray, "draws ticks n"]
+    draws: tuple[Float[np.ndarray, "draws ticks n"], ...]
+
+    @classmethod
+    def of(cls, plant: Plant, log: Log, replay: Replay) -> _Loop:
+        """Return a loop with draws of noise, the first set for comparisons and all for the mean readings."""
+        draws = _opposite(replay, _MANY_PAIRS)
+        half = draws[: len(draws) // 2]
+        few = min(_FEW_PAIRS, len(half))
+        sets = (half[k : k + few] for k in range(0, len(half) - few + 1, few))
+        return cls(plant, log, replay, tuple(np.concatenate([one, -one]) for one in sets))
 
     def mean(self, noise: ReadingNoise) -> Float[np.ndarray, "time n"]:
         """Return the mean readings with a noise."""
-        return np.asarray(_mean_readings(noise.rounded(self.replay, self.draws), self.plant))
+        return np.mean([self._mean(noise, draws) for draws in self.draws], axis=0)
+
+    def _mean(self, noise: ReadingNoise, draws: np.ndarray) -> Float[np.ndarray, "time n"]:
+        return np.asarray(_mean_readings(noise.rounded(self.replay, draws), self.plant))
 
     def squares(self, noise: ReadingNoise) -> Float[np.ndarray, " n"]:
-        """Return the sum of squares that the mean readings leave of the log, by joint."""
-        off = self.log.filled - self.mean(noise)
+        """Return the sum of squares that mean readings of the first draws leave of the log, by joint."""
+        off = self.log.filled - self._mean(noise, self.draws[0])
         return np.nan_to_num(np.sum(np.where(self.log.measured, off, 0.0) ** 2, axis=0), nan=np.inf)
 
     def at_best_level(self, noise: ReadingNoise, levels: list[np.ndarray]) -> ReadingNoise:
@@ -284,4 +298,4 @@ def mean_readings(machine: Machine, log: Log, replay: Replay) -> Float[np.ndarra
     if noise is None:
         return None
     replay = replay.following(machine.parameters.places, jnp.asarray(machine.parameters.guess))
-    return _Loop(machine.plant, log, replay, _opposite(replay, _MANY_PAIRS)).mean(noise)
+    return _Loop.of(machine.plant, log, replay).mean(noise)
