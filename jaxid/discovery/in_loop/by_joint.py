@@ -29,6 +29,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.apart.joint import JointAlone, joints_alone
 from jaxid.estimators.apart.loads import with_simulated_loads
 from jaxid.estimators.apart.session import session_of_joint
+from jaxid.estimators.apart.start import starts_beside
 from jaxid.estimators.apart.steps import common_numerics, joint_fits, of_arm, side_by_side
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
@@ -47,6 +48,8 @@ _RENEWALS = 6
 # Most searches of one joint, and the change by which other loads call for one, or a gain for another renewal
 # [nats]: a third of what counts as visible in the benchmarks.
 _SEARCHES, _NEWS = 3, 10.0
+# Factor in RMS over the noise beyond which a fit is tried from other delays.
+_FAR = 1.2
 
 
 def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
@@ -118,13 +121,13 @@ class ArmSearch:
     @property
     def by_excess(self) -> list[int]:
         """The joints that move, first the one whose fit leaves most over the noise of its encoder."""
+        return sorted(self.declared, key=lambda joint: -self._excess(joint))
 
-        def excess(joint: int) -> float:
-            fit = self.declared[joint]
-            floor = position_noise(fit.machine, self._alone(joint).parts[0].log)[0]
-            return float(np.sqrt(np.mean(np.square(fit.residual)))) / max(float(floor), 1e-300)
-
-        return sorted(self.declared, key=lambda joint: -excess(joint))
+    def _excess(self, joint: int) -> float:
+        """Return what the fit of a joint leaves over the noise of its encoder."""
+        fit = self.declared[joint]
+        floor = position_noise(fit.machine, self._alone(joint).parts[0].log)[0]
+        return float(np.sqrt(np.mean(np.square(fit.residual)))) / max(float(floor), 1e-300)
 
     def _alone(self, joint: int) -> JointAlone:
         return next(alone for alone in self.every if alone.joint == joint)
@@ -139,8 +142,27 @@ class ArmSearch:
         for _ in range(_RENEWALS):
             arm, out, gained = arm.renewed(out)
             if gained < _NEWS:
+                arm, gained = arm.at_other_delays(out)
+            if gained < _NEWS:
                 break
         return arm, out
+
+    def at_other_delays(self, found: Mapping[int, Discovery]) -> tuple[ArmSearch, float]:
+        """Return the arm with fits from other delays, where those leave less, and what they gain [nats].
+
+        Args:
+            found: Joints that were searched, which keep their fits.
+        """
+        declared, gained = dict(self.declared), 0.0
+        for joint in (j for j in self.by_excess if j not in found and self._excess(j) > _FAR):
+            alone = self._alone(joint).with_estimate(declared[joint].theta)
+            starts = [alone.with_estimate(start) for start in starts_beside(alone)]
+            old = declared[joint]
+            best = min([old, *_refitted(self.session, starts)], key=_squares)
+            if best is not old:
+                gained += _gained(old, best)
+                declared[joint] = best
+        return replace(self, declared=declared), gained
 
     def renewed(self, found: Mapping[int, Discovery]) -> tuple[ArmSearch, dict[int, Discovery], float]:
         """Return the arm with the loads of its simulation, and refits of the joints that gain by them.
@@ -165,10 +187,10 @@ class ArmSearch:
         parted = [[a for a in tried if (a.joint in found) is done] for done in (False, True)]
         fits = [*_fitted(self.session, parted[0]), *_refitted(self.session, parted[1])]
         for alone, fit in zip([*parted[0], *parted[1]], fits, strict=True):
-            joint, old, new = alone.joint, _squares(known[alone.joint]), _squares(fit)
-            if not new < old:
+            joint, old = alone.joint, known[alone.joint]
+            if not _squares(fit) < _squares(old):
                 continue
-            gained += 0.5 * fit.residual.size * float(np.log(old / max(new, 1e-300)))
+            gained += _gained(old, fit)
             if joint in found:
                 out[joint] = replace(found[joint], after=fit)
             else:
@@ -309,6 +331,11 @@ def _moved(found: Discovery, alone: JointAlone) -> float:
         change = (after.position - before.position) / position_noise(machine, run.log)
         total += 0.5 * float(np.sum(np.square(change)))
     return total if np.isfinite(total) else np.inf
+
+
+def _gained(old: Estimate, new: Estimate) -> float:
+    """Return what a fit gains in log-likelihood over an older one [nats]."""
+    return 0.5 * new.residual.size * float(np.log(_squares(old) / max(_squares(new), 1e-300)))
 
 
 def _squares(fit: Estimate) -> float:

@@ -27,6 +27,8 @@ from jaxid.model.unknowns import CONTROLLER
 
 # Delays that are tried, if the delay is unknown [s].
 _DELAYS = np.arange(0.0, 0.205, 0.005)
+# Steps of these on either side of a fit from which it is tried again.
+_BESIDE = 2
 # Gains that are tried, as parts of the guess.
 _GAINS = (1 / 300, 1 / 100, 1 / 30, 1 / 10, 1 / 3, 1.0)
 # Largest factor by which a start may differ from the guess.
@@ -54,6 +56,27 @@ def starts_by_balance(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
         return []
     delays = range(len(_DELAYS)) if "delay" in unknown else [_nearest(_delay(machine))]
     starts = [_start(machine, unknown, found) for found in balance.solutions(delays, _stiffness(machine))]
+    return [start for start in starts if is_stable(machine.with_estimate(start))]
+
+
+def starts_beside(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
+    """Return values of a joint's unknowns by the balance at delays beside its own; empty if it is known.
+
+    A command that is held from row to row leaves the cost several minima along the delay, less than a row
+    apart.
+
+    Args:
+        alone: The joint at the values of a fit.
+    """
+    machine = alone.machine
+    unknown = {_role(f.path, machine): k for k, f in enumerate(machine.parameters.free)}
+    balance = _Balance.of(alone) if {"kp", "delay"} <= unknown.keys() else None
+    if balance is None:
+        return []
+    own = _nearest(float(machine.parameters.guess[unknown["delay"]]))
+    beside = [k for k in range(own - _BESIDE, own + _BESIDE + 1) if 0 <= k < len(_DELAYS)]
+    found = [next(balance.solutions([k], _stiffness(machine))) for k in beside]
+    starts = [_start(machine, unknown, one) for one in found]
     return [start for start in starts if is_stable(machine.with_estimate(start))]
 
 
