@@ -33,7 +33,7 @@ _FLOORS = (1e-2, 1e-3, 1e-4)
 _MOST, _READING_RANGE = 1e2, (1e-3, 1e3)
 # Noise of the force, as a part of it, below which sticking is certain.
 _QUIET = 1e-3
-# Steps of the last fit of such a log for each one before.
+# Steps of the last fit of such a log for each one before, and least number with a lag in the drive.
 _FINER = 4
 
 
@@ -142,7 +142,12 @@ def needed_numerics(machine: Machine, log: Log, start: np.ndarray | None) -> Num
     """Return the settings of the integration that a machine needs at its start."""
     # Guesses that are far off, such as inertias of no possible body, may need many more steps.
     near = machine if start is None else machine.with_estimate(np.clip(start, *machine.parameters.bounds))
-    return exact_numerics(machine, log, needed_steps(near, log))
+    steps = needed_steps(near, log)
+    own = machine.plant.initial_states(jnp.zeros(machine.gain.size))
+    if jax.tree.leaves(own) and slides(machine, log):
+        # Behind a lag the force changes within a step, and with it the instant at which a joint turns.
+        steps = max(steps, _FINER)
+    return exact_numerics(machine, log, steps)
 
 
 def _force_scale(machine: Machine, log: Log) -> Float[np.ndarray, " m"]:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 # Largest product of step and fastest decay for which the fourth-order step keeps both trajectory
 # and gradient (it becomes unstable at 2.78; beyond 1 the gradient error exceeds 1 %).
 _LARGEST_STEP = 1.0
+# Shortest part of a sample before or after the change of a delayed command.
+_SHORTEST = 1e-6
 
 
 class Trajectory(eqx.Module):
@@ -89,7 +91,36 @@ class Drive(eqx.Module):
         if self.solver is not None:
             whole, solver = jnp.asarray(self.period), self.solver
             return lambda x, ends, t: solver(plant, x, ends, t, whole)
-        h, plant = jnp.asarray(self.period / self.substeps), plant.prepared()
+        plant = plant.prepared()
+        if not self.switches(plant):
+            return self._fixed_steps(plant, x, ends, jnp.asarray(self.period))
+
+        shift = plant.command_delays(1)[0] / self.period
+        older = shift - jnp.floor(shift)
+        # Neither part is empty, for the derivatives; the value is moved, and its slope is not.
+        older = older + jax.lax.stop_gradient(jnp.clip(older, _SHORTEST, 1.0 - _SHORTEST) - older)
+        lengths = (self.period * older, self.period * (1.0 - older))
+        parts = [self._fixed_steps(plant, x, ends[:1], length) for length in lengths]
+
+        def both(x: State, ends: tuple[Array, ...], t: Array) -> State:
+            return parts[1](parts[0](x, ends[:1], t), ends[1:], t + lengths[0])
+
+        return both
+
+    def switches(self, plant: Plant) -> bool:
+        """Check that the delayed command changes within the samples, at one instant.
+
+        Dry friction turns where the force does: a line in place of the two values would turn it at another
+        instant. Several drives may each change at their own, and take the line.
+        """
+        delayed = self.hold == "zero_order" and any(e.delays_command() for e in plant.effects)
+        return self.set_valued and self.solver is None and self.gain.size == 1 and delayed
+
+    def _fixed_steps(
+        self, plant: Plant, x: State, ends: tuple[Array, ...], length: Array
+    ) -> Callable[[State, tuple[Array, ...], Array], State]:
+        """Return the advance of a state by a time [s], in `substeps` steps; see `stepper`."""
+        h = length / self.substeps
         flow = affine_flow(plant, x, ends, jnp.zeros(()), h) if self.set_valued else None
 
         def one(x: State, ends: tuple[Array, ...], t: Array) -> State:
@@ -165,10 +196,13 @@ def interval_forces(plant: Plant, drive: Drive, command: Float[Array, "time m"])
     """Return the declared force at the start and the end of every interval, delay applied.
 
     In an interval with a change of a held command, a line has the same mean and first moment, see
-    `shifted_hold`.
+    `shifted_hold`; or the values before and after the change are returned, see `Drive.switches`.
     """
     force = drive.gain * command
     shift = plant.command_delays(force.shape[1]) / drive.period
+    if drive.switches(plant):
+        older, newer = (shifted(force, jnp.floor(shift) + k) for k in (1, 0))
+        return older, newer
     if stays_held(plant, drive):
         start = shifted(force, shift)
         return start, start
@@ -273,13 +307,20 @@ def closed_loop(
 def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[tuple[Array, ...], Array]:
     """Return the declared force at the ends of the coming interval, and the updated memory of past ones.
 
-    A force that is constant over the interval is given once; else see `shifted_hold`.
+    A force that is constant over the interval is given once; else see `interval_forces`.
     """
     force = drive.gain * u
     if drive.longest_delay == 0:
         return (force,), past
     past = jnp.concatenate([force[None], past[:-1]])
     shift = jnp.clip(plant.command_delays(u.size) / drive.period, 0.0, drive.longest_delay)
+    if drive.switches(plant):
+        whole = jnp.minimum(jnp.floor(shift), drive.longest_delay - 1.0)
+        older, newer = (
+            jnp.sum(jnp.where(jnp.arange(drive.longest_delay + 1)[:, None] == whole + k, past, 0.0), axis=0)
+            for k in (1, 0)
+        )
+        return (older, newer), past
     # Hat weights over the last samples: linear interpolation without a data-dependent index.
     away = jnp.arange(drive.longest_delay + 1)[:, None] - shift
     hat = jnp.maximum(0.0, 1.0 - jnp.abs(away))

@@ -1,5 +1,7 @@
 """Trajectories: the scan against diffrax, controllers against plain Python, delay and rounding."""
 
+import dataclasses
+
 import diffrax
 import equinox as eqx
 import jax
@@ -22,6 +24,9 @@ from jaxid.simulation.loops import (
     open_loop,
     with_diffrax,
 )
+from truth.axis.machines import Setup, emps_like, multisine
+from truth.axis.stepper import Loop
+from truth.axis.stepper import Sensor as TrueSensor
 
 MASS, PERIOD, SAMPLES = 2.0, 1e-2, 60
 TIMES = PERIOD * np.arange(SAMPLES)
@@ -236,3 +241,22 @@ def test_rounding_that_noise_dithers_is_read_as_its_mean():
         readings = loud.read(jnp.full((200_000, 1), at), jnp.asarray(noise))
         assert float(jnp.mean(readings)) == pytest.approx(at, abs=1e-2 * 1e-3)
         assert float(jnp.std(readings)) == pytest.approx(float(loud.position_std), rel=0.03)
+
+
+@pytest.mark.parametrize("delay", [0.0, 2.37e-3, 3e-3])
+def test_friction_turns_where_a_delayed_command_does(delay):
+    """A line with the mean and moment of the two values turned it elsewhere: 1.7e-6 m away in the end."""
+    t = np.arange(600) / 1000.0
+    force = multisine(t, [3.1, 7.9, 13.3], 4.0, 0)
+    machine = emps_like().machine
+    machine = dataclasses.replace(machine, effects={**machine.effects, "input_delay": {"delay": delay}})
+    law = Loop(kind="open_loop", input=force)
+    run = Setup(machine, law, TrueSensor(), rate=1000.0, duration=0.6, seed=0).run()
+
+    effects = [EFFECTS[kind](**values) for kind, values in machine.effects.items()]
+    plant = Axis(jnp.asarray(machine.inertia), effects=tuple(effects))
+    drive = Drive(jnp.asarray([machine.actuator_gain]), 1e-3, set_valued=True)
+    command = jnp.asarray(run["true_command"])[:, None]
+    ours = open_loop(plant, drive, command, jnp.zeros(1), jnp.zeros(1))
+    np.testing.assert_allclose(ours.position[:, 0], run["true_position"], atol=1e-8)
+    assert np.ptp(run["true_position"]) > 1e-3
