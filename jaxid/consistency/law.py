@@ -331,8 +331,8 @@ def noise_free_command(machine: Machine, log: Log) -> Float[np.ndarray, "time m"
         log: The log.
 
     Returns:
-        The command, (time, m); None if the law cannot be computed, if the log is slower than the loop, or if
-        the law does not explain the logged command.
+        The command, (time, m); None if the law cannot be computed, if the log is slower than the loop, if the
+        law does not explain the logged command, or if it integrates.
     """
     replayed = replayed_law(machine, log)
     if replayed is None or replayed.every > 1 or log.samples < 10 * _SETTLING:
@@ -346,6 +346,10 @@ def noise_free_command(machine: Machine, log: Log) -> Float[np.ndarray, "time m"
         return None
     if np.all(noise <= _ROUNDED * size):
         return command
+    if isinstance(machine.controller, PID) and np.any(np.asarray(machine.controller.ki) != 0):
+        # Its integral began at a value that only the mean of the noise tells: a constant force would have the
+        # error of that, and a far smaller standard deviation.
+        return None
     # A law that is right but for a few ticks, such as a pulse that begins a tick later, leaves outliers.
     middle = _NORMAL * np.median(np.abs(off), axis=0)
     if np.any(noise > _OUTLIERS * middle):
