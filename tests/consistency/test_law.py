@@ -6,6 +6,7 @@ import tomllib
 
 import pytest
 
+from jaxid.consistency.law import noise_free_command
 from jaxid.errors import InputError
 from jaxid.session import Session, open_session
 from tests.consistency.test_noise import EFFECTS, LOOPS, setup
@@ -78,3 +79,11 @@ def test_a_log_of_one_tick_in_ten_is_replayed_between_its_samples(runs):
     assert not [f for f in right.findings if "law" in f.what]
     with pytest.raises(InputError, match=r"derivative = 'velocity', kp = 2[34]\d\d, kd = (59|6\d)"):
         opened(slow, LAWS["pd"], "pd")
+
+
+@pytest.mark.parametrize(("loop", "known"), [("cascade_pd", True), ("pid", False)])
+def test_a_noisy_command_of_a_law_with_an_integral_is_taken_as_it_was_read(loop, known):
+    """Its integral began anywhere: what only the mean of the noise tells made constant_force 44 sigma off."""
+    run = setup(loop, 0.03).run()
+    session = opened({column: run[field] for column, field in NAMES.items()}, LAWS[loop], loop)
+    assert (noise_free_command(session.machine, session.fit.log) is not None) == known
