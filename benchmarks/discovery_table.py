@@ -126,11 +126,13 @@ def _origin(records: Sequence[Record]) -> str:
     of = ", ".join(
         f"{commit} ({count} cases)" if len(commits) > 1 else commit for commit, count in commits.items()
     )
-    last = Counter(r.get("method", "no result") for r in records if r.get("refit", False))
+    last = Counter(r["method"] for r in records if r.get("refit", False))
     refits = ", ".join(f"{count} by {method.replace('_', ' ')}" for method, count in last.most_common())
-    without = sum(not r.get("refit", False) for r in records)
-    words = [f"refitted as the command does, the values kept are {refits}" if last else ""]
+    ended = sum("error" in r for r in records)
+    without = len(records) - ended - sum(last.values())
+    words = [f"refitted as the command does; methods whose values were kept: {refits}" if last else ""]
     words.append(f"{without} without the refit" if without else "")
+    words.append(f"{ended} refused or ended in an error" if ended else "")
     return f"commit {of}; " + "; ".join(filter(None, words))
 
 

@@ -67,8 +67,8 @@ def prediction_error(
 
     An extended Kalman filter on the plant's step, driven by the logged command, predicts each reading from
     those before it. In open loop and in a loop the estimate is the same function of the log, because the
-    command is measured. If the declared law explains the logged command but for white noise of its reading,
-    the command of the law is used.
+    command is measured. If the declared law has no integral and explains the logged command but for white
+    noise of its reading, the command of the law is used.
 
     Args:
         machine: The machine. Its sensor gives the first values of the noise. If links must be those of real

@@ -113,8 +113,8 @@ class Drive(eqx.Module):
         Dry friction turns where the force does: a line in place of the two values would turn it at another
         instant. Several drives may each change at their own, and take the line.
         """
-        delayed = self.hold == "zero_order" and any(e.delays_command() for e in plant.effects)
-        return self.set_valued and self.solver is None and self.gain.size == 1 and delayed
+        exact = self.set_valued and self.solver is None and self.gain.size == 1
+        return exact and self.hold == "zero_order" and not stays_held(plant, self)
 
     def _fixed_steps(
         self, plant: Plant, x: State, ends: tuple[Array, ...], length: Array

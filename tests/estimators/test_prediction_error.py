@@ -14,11 +14,12 @@ from jaxid.consistency.law import noise_free_command
 from jaxid.errors import InputError
 from jaxid.estimators.choice import choose_method
 from jaxid.estimators.common.scoring import maximise_likelihood
-from jaxid.estimators.likelihood import likelihood_of
+from jaxid.estimators.likelihood import likelihood_of, needed_numerics
 from jaxid.estimators.prediction_error import prediction_error, whiteness
 from jaxid.session import open_session
 from jaxid.simulation.kalman import readings_used, slow_samples, smooth_steps
-from truth.axis.cases import case_text
+from tests.support.axis_log import log_of
+from truth.axis.cases import case_text, write_case
 from truth.axis.machines import EMPS_ACCELERATION, EMPS_LOOP, Setup, emps_like, moves, multisine
 from truth.axis.stepper import Loop, Machine, Sensor
 
@@ -293,3 +294,15 @@ def test_samples_at_rest_and_at_reversals_are_slow(tmp_path):
     slow = slow_samples(measured, np.array([5e-3]))[:, 0]
     assert slow[np.abs(velocity) < 1e-4].mean() > 0.9
     assert not slow[np.abs(velocity) > 0.04].any()
+
+
+@pytest.mark.parametrize(("lag", "friction", "steps"), [(True, True, 4), (True, False, 1), (False, True, 1)])
+def test_friction_behind_a_lag_takes_finer_steps(tmp_path, lag, friction, steps):
+    """The force changes within a step: with one a sample a fit lost 1800 of log-likelihood."""
+    axis = emps_like(0, 1.0, 1.0)
+    effects = {"viscous_friction": {"coefficient": 203.5}}
+    effects |= {"coulomb_friction": {"level": 20.39}} if friction else {}
+    effects |= {"actuator_lag": {"time_constant": 0.01}} if lag else {}
+    text = case_text(axis, [*effects.items()], off=1.0)
+    session = open_session(write_case(tmp_path, text), log_of(axis))
+    assert needed_numerics(session.machine, session.fit.log, None).substeps == steps

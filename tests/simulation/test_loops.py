@@ -16,6 +16,7 @@ from jaxid.model.unknowns import scatter
 from jaxid.numerics.delays import shifted_hold
 from jaxid.plants import Axis
 from jaxid.sensors.encoder import Sensor
+from jaxid.session import open_session
 from jaxid.simulation.loops import (
     Drive,
     closed_loop,
@@ -24,6 +25,9 @@ from jaxid.simulation.loops import (
     open_loop,
     with_diffrax,
 )
+from jaxid.simulation.replay import exact_numerics, make_replay
+from tests.support.axis_log import log_of
+from truth.axis.cases import case_text, write_case
 from truth.axis.machines import Setup, emps_like, multisine
 from truth.axis.stepper import Loop
 from truth.axis.stepper import Sensor as TrueSensor
@@ -260,3 +264,18 @@ def test_friction_turns_where_a_delayed_command_does(delay):
     ours = open_loop(plant, drive, command, jnp.zeros(1), jnp.zeros(1))
     np.testing.assert_allclose(ours.position[:, 0], run["true_position"], atol=1e-8)
     assert np.ptp(run["true_position"]) > 1e-3
+
+
+def test_friction_turns_where_a_delayed_command_does_in_a_loop(tmp_path):
+    """A line for the two values of an interval left 2.4e-7 m, 500 times as much."""
+    setup = emps_like(0, 0.0, 4.0)
+    machine = setup.machine.with_effect("input_delay", delay=2.37e-3)
+    setup = dataclasses.replace(setup, machine=machine, sensor=TrueSensor())
+    text = case_text(setup, [*machine.effects.items()], off=1.0, sensor=False)
+    session = open_session(write_case(tmp_path, text), log_of(setup))
+
+    log, ours = session.fit.log, session.machine
+    replay = make_replay(ours, log, exact_numerics(ours, log, 1))
+    run = setup.run()
+    np.testing.assert_allclose(replay(ours.plant).position[:, 0], run["true_position"], atol=2e-9)
+    assert np.ptp(run["true_position"]) > 0.1
