@@ -126,7 +126,9 @@ def test_what_was_found_is_refitted_under_the_load_of_the_links(monkeypatch):
 def test_a_joint_is_searched_again_only_if_other_loads_move_it(monkeypatch):
     session = open_session(servo_arm_case(dry()) | {"sensor": {"position_noise": 2e-4}}, still())
     alone, own = loaded(session, 0.0)
-    fit = SimpleNamespace(machine=own.machine, theta=own.machine.parameters.guess, residual=np.ones(3))
+    fit = SimpleNamespace(
+        machine=own.machine, theta=own.machine.parameters.guess, residual=np.ones(3), samples=3
+    )
     search = SimpleNamespace(session=own, after=fit, effects=(), kinds=[])
     arm = ArmSearch(session, parts_of(session), [alone], {0: fit})
     for force, again in ((0.0, []), (1e-4, []), (0.5, [0])):
@@ -135,6 +137,22 @@ def test_a_joint_is_searched_again_only_if_other_loads_move_it(monkeypatch):
         assert arm.waiting({}, Counter()) == [0]
         assert arm.waiting({0: search}, Counter({0: 1})) == again
         assert arm.waiting({0: search}, Counter({0: 3})) == []
+
+
+def test_readings_at_rest_leave_the_fit_of_a_joint_as_good_as_it_is():
+    """They have no residual: a fit with such readings was taken for one that diverged, and never renewed."""
+    session = open_session(servo_arm_case(dry()) | {"sensor": {"position_noise": 2e-4}}, still())
+    every = joints_alone(session.machine, parts_of(session))
+
+    def fit(alone, *residual):
+        rows = np.array(residual)[:, None]
+        return SimpleNamespace(machine=alone.machine, residual=rows, samples=int(np.isfinite(rows).sum()))
+
+    fits = {0: fit(every[0], 1e-3, 1e-3, 1e-3), 1: fit(every[1], np.nan, 3e-3, 3e-3)}
+    assert ArmSearch(session, parts_of(session), every, fits).by_excess == [1, 0]
+    fits[0] = fit(every[0], np.inf, np.nan, np.nan)
+    fits[0].samples = 3
+    assert ArmSearch(session, parts_of(session), every, fits).by_excess == [0, 1]
 
 
 def test_joints_go_by_number_and_by_name():

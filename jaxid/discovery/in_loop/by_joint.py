@@ -127,7 +127,7 @@ class ArmSearch:
         """Return what the fit of a joint leaves over the noise of its encoder."""
         fit = self.declared[joint]
         floor = position_noise(fit.machine, self._alone(joint).parts[0].log)[0]
-        return float(np.sqrt(np.mean(np.square(fit.residual)))) / max(float(floor), 1e-300)
+        return float(np.sqrt(_squares(fit) / max(fit.samples, 1))) / max(float(floor), 1e-300)
 
     def _alone(self, joint: int) -> JointAlone:
         return next(alone for alone in self.every if alone.joint == joint)
@@ -335,13 +335,14 @@ def _moved(found: Discovery, alone: JointAlone) -> float:
 
 def _gained(old: Estimate, new: Estimate) -> float:
     """Return what a fit gains in log-likelihood over an older one [nats]."""
-    return 0.5 * new.residual.size * float(np.log(_squares(old) / max(_squares(new), 1e-300)))
+    return 0.5 * new.samples * float(np.log(_squares(old) / max(_squares(new), 1e-300)))
 
 
 def _squares(fit: Estimate) -> float:
     """Return the squared residual of a fit; infinite if it diverged."""
-    total = float(np.sum(np.square(fit.residual)))
-    return total if np.isfinite(total) else np.inf
+    # Readings that do not count, of a joint at rest, have no residual.
+    counted = fit.residual[np.isfinite(fit.residual)]
+    return float(np.sum(np.square(counted))) if counted.size == fit.samples else np.inf
 
 
 def joint_words(session: Session, joint: int) -> str:
