@@ -255,10 +255,11 @@ def drawn_readings(
         runs: Number of draws.
     """
     assert replay.disturbance is not None, "only a loop reads its encoder"
-    shape, rng = (_TOGETHER, len(replay.disturbance), replay.position.size), np.random.default_rng(40)
+    together = min(runs, _TOGETHER)
+    shape, rng = (together, len(replay.disturbance), replay.position.size), np.random.default_rng(40)
     parts = [
         np.asarray(_readings(noise.rounded(replay, rng.standard_normal(shape)), plant))
-        for _ in range(0, runs, _TOGETHER)
+        for _ in range(0, runs, together)
     ]
     readings = np.concatenate(parts)[:runs]
     return readings - readings.mean(axis=0)
@@ -286,8 +287,12 @@ def _start_columns(replay: NoisyReplay, plant: Plant, nudge: Array) -> tuple[Arr
     return mean, columns
 
 
-def mean_readings(machine: Machine, log: Log, replay: Replay) -> Float[np.ndarray, "time n"] | None:
-    """Return the mean readings of a log by a machine at its values; None if nothing is known of the noise.
+def noisy_readings(
+    machine: Machine, log: Log, replay: Replay
+) -> tuple[Float[np.ndarray, "time n"], Float[np.ndarray, "runs time n"]] | None:
+    """Return the mean readings of a log by a machine at its values, and draws of readings about their mean.
+
+    Nothing is returned if nothing is known of the noise. A long log gets fewer draws.
 
     Args:
         machine: The machine, at the values of a fit.
@@ -297,5 +302,8 @@ def mean_readings(machine: Machine, log: Log, replay: Replay) -> Float[np.ndarra
     noise = estimated_noise(machine, log, replay)
     if noise is None:
         return None
+    assert replay.disturbance is not None, "only a loop reads its encoder"
+    runs = int(np.clip(_TICKS // len(replay.disturbance), 2 * _FEWEST_PAIRS, _TOGETHER))
     replay = replay.following(machine.parameters.places, jnp.asarray(machine.parameters.guess))
-    return _Loop.of(machine.plant, log, replay).mean(noise)
+    mean = _Loop.of(machine.plant, log, replay).mean(noise)
+    return mean, drawn_readings(noise, replay, machine.plant, runs)

@@ -7,7 +7,7 @@ import pytest
 import jaxid
 from benchmarks.unforced_machines import COUNT, NOISE, servo
 from jaxid.sensors.encoder import Sensor
-from jaxid.simulation.noisy_loop import mean_readings
+from jaxid.simulation.noisy_loop import noisy_readings
 from jaxid.simulation.replay import Numerics, make_replay
 
 
@@ -34,8 +34,10 @@ def test_mean_readings_explain_what_a_loop_without_noise_leaves(seed):
     truth = [drawn.truth()[name] for name in result.estimate.names]
     machine, log = result.estimate.machine.with_estimate(truth), result.session.fit.log
     replay = make_replay(machine, log, Numerics(substeps=4, longest_delay=100))
-    mean = mean_readings(machine, log, replay)
-    assert mean is not None
+    found = noisy_readings(machine, log, replay)
+    assert found is not None
+    mean, draws = found
+    assert np.max(np.abs(draws.mean(axis=0))) < 1e-9
     left = mean[:, 0] - quiet - moved
     noise = np.hypot(NOISE, COUNT / np.sqrt(12))
     assert np.sqrt(np.mean(moved**2)) > 0.4 * noise

@@ -20,9 +20,10 @@ from jaxid.gap import ForceGap, SimulationGap, noise_density, row_noise
 from jaxid.logs.soundness import position_levels
 from jaxid.machine import Machine
 from jaxid.numerics.coloured_noise import NoiseModel
+from jaxid.numerics.filters import high_band_std
 from jaxid.session import OpenedLog
 from jaxid.simulation.force_balance import ForceData, inertial_force
-from jaxid.simulation.noisy_loop import mean_readings
+from jaxid.simulation.noisy_loop import noisy_readings
 from jaxid.simulation.replay import make_replay
 from jaxid.simulation.sensor_noise import position_noise
 
@@ -38,6 +39,8 @@ _FEWEST = 20
 _EXCESS, _EXCESS_ELSEWHERE = 0.05, 0.1
 # Factor in RMS over the noise of an encoder beyond which its effect in a loop, half of it, decides nothing.
 _NEAR = 3.0
+# Least periodograms in each value of the spectrum of drawn readings.
+_PERIODOGRAMS = 100
 # Probability that the periodogram of white noise exceeds the limit; there is one test for each joint and log.
 _RARELY = 1e-3
 # Factor in RMS by which a residual of the right colour may exceed the noise, which is known to a few tenths,
@@ -178,8 +181,10 @@ def position_residuals(
     """Compare the position that a simulated loop leaves of a log without a force with the encoder's noise.
 
     The mean readings of a loop that reads a noisy encoder count, since the noise moves them; see
-    `jaxid.simulation.noisy_loop`. Rounding to a count is white only while the joint moves by a good part of a
-    count in a sample. Slower samples do not count.
+    `jaxid.simulation.noisy_loop`. The noise also shakes the machine, so that readings scatter about their
+    mean with the colour of the loop: the residual is whitened by the spectrum of drawn readings. Rounding to
+    a count is white only while the joint moves by a good part of a count in a sample. Slower samples do not
+    count.
 
     Args:
         machine: The fitted machine.
@@ -202,14 +207,22 @@ def position_residuals(
     if not machine.unforced(run.log) or not noise_decides:
         return found
     numerics = choose_numerics(machine, run.log)
-    expected = mean_readings(machine, run.log, make_replay(machine, run.log, numerics))
-    return found if expected is None else _positions_left(machine, run, expected, fitted=fitted)
+    noisy = noisy_readings(machine, run.log, make_replay(machine, run.log, numerics))
+    return found if noisy is None else _positions_left(machine, run, *noisy, fitted=fitted)
 
 
 def _positions_left(
-    machine: Machine, run: OpenedLog, simulated: Float[np.ndarray, "time n"], *, fitted: bool
+    machine: Machine,
+    run: OpenedLog,
+    simulated: Float[np.ndarray, "time n"],
+    drawn: Float[np.ndarray, "runs time n"] | None = None,
+    *,
+    fitted: bool,
 ) -> list[Residual]:
-    """Compare the position that a simulation leaves of a log with the encoder's noise, by joint."""
+    """Compare the position that a simulation leaves of a log with the encoder's noise, by joint.
+
+    The noise is white, or else that of drawn readings.
+    """
     floor, least = position_noise(machine, run.log), _EXCESS if fitted else _EXCESS_ELSEWHERE
     out = []
     for k in np.flatnonzero(run.log.measured).tolist():
@@ -217,7 +230,10 @@ def _positions_left(
         rms = float(np.sqrt(np.mean(e**2)))
         step = position_levels(run.log.position[:, k])[1]
         moving = np.abs(run.data.qd[:, k]) >= _ROUNDS_WHITE * step * run.log.rate_hz
-        excess, count, power = cumulated_excess(e[moving] / max(float(floor[k]), 1e-300))
+        size = max(float(floor[k]), 1e-300)
+        level = size if machine.sensor.position_std is not None else None
+        colour = 1.0 if drawn is None else spectrum_of_draws(drawn[:, :, k], moving, level)
+        excess, count, power = cumulated_excess(e[moving] / size, colour)
         found = Residual(
             log=run.name,
             joint=k,
@@ -232,6 +248,26 @@ def _positions_left(
         loud = power > _LOUDER**2 + _SCATTER / np.sqrt(max(count, 1))
         out.append(_decided(found, count, loud=loud, stated=True))
     return out
+
+
+def spectrum_of_draws(
+    drawn: Float[np.ndarray, "runs time"], moving: np.ndarray, level: float | None
+) -> Float[np.ndarray, " f"]:
+    """Return the spectrum of drawn readings at the samples in motion, over that of white noise.
+
+    Args:
+        drawn: Readings less their mean.
+        moving: Samples that count, (time,).
+        level: Standard deviation of the white noise; None: that which the high band of a draw shows, as a
+            log's does.
+    """
+    if level is None:
+        level = float(np.sqrt(np.mean(np.square(high_band_std(drawn.T)))))
+    power = np.mean(np.abs(np.fft.rfft(drawn[:, moving])) ** 2, axis=0)[1:]
+    width = min(-(-_PERIODOGRAMS // len(drawn)), max(len(power), 1))
+    ones = np.ones(width)
+    smooth = np.convolve(power, ones, "same") / np.convolve(np.ones_like(power), ones, "same")
+    return smooth / (max(int(moving.sum()), 1) * max(level, 1e-300) ** 2)
 
 
 def _decided(found: Residual, count: int, *, loud: bool, stated: bool) -> Residual:
@@ -250,7 +286,9 @@ def _decided(found: Residual, count: int, *, loud: bool, stated: bool) -> Residu
     return found
 
 
-def cumulated_excess(z: Float[np.ndarray, " row"]) -> tuple[float, int, float]:
+def cumulated_excess(
+    z: Float[np.ndarray, " row"], colour: Float[np.ndarray, " f"] | float = 1.0
+) -> tuple[float, int, float]:
     """Return the largest excess of a series' cumulated periodogram over a white one in the filter's band.
 
     Of a white series the excess stays below sqrt(-ln(p) / 2 m) with probability 1 - p, m being the number of
@@ -258,6 +296,7 @@ def cumulated_excess(z: Float[np.ndarray, " row"]) -> tuple[float, int, float]:
 
     Args:
         z: Whitened residual, (row,).
+        colour: Spectrum by which it is whitened further, at its frequencies above zero, (f,); 1: not at all.
 
     Returns:
         The excess as a part of the power, the number of frequencies, and the mean power in the band.
@@ -266,7 +305,7 @@ def cumulated_excess(z: Float[np.ndarray, " row"]) -> tuple[float, int, float]:
         Bartlett (1955), An Introduction to Stochastic Processes; Durbin (1969), Biometrika 56, 1-15; the
         one-sided limit is that of Kolmogorov and Smirnov.
     """
-    power = np.abs(np.fft.rfft(z))[1:] ** 2
+    power = np.abs(np.fft.rfft(z))[1:] ** 2 / np.maximum(colour, 1e-300)
     power = power[: int(_BAND * len(power))]
     count, total = len(power), float(power.sum())
     if count == 0 or total <= 0:
