@@ -154,6 +154,18 @@ def estimated_noise(
     Returns:
         The noise; None if the log has velocities in place of positions, or no reading has any noise.
     """
+    found = _noise_in_loop(machine, log, replay, follows)
+    if found is None:
+        return None
+    noise, loop = found
+    smooth = np.asarray(_mean_readings(noise.on(loop.replay), machine.plant))
+    return replace(noise, shift=loop.mean(noise) - smooth)
+
+
+def _noise_in_loop(
+    machine: Machine, log: Log, replay: Replay, follows: bool
+) -> tuple[ReadingNoise, _Loop] | None:
+    """Return the noise of `estimated_noise` without its shift, and the loop at the machine's values."""
     if log.integrated or replay.controller is None:
         return None
     n, sensor = log.position.shape[1], machine.sensor
@@ -174,9 +186,7 @@ def estimated_noise(
     begun = [ReadingNoise(count, levels[0], np.zeros(2 * n), rest, follows=follows) for rest in (False, True)]
     noises = [loop.started(loop.at_best_level(noise, levels)) for noise in begun]
     noise = min(noises, key=lambda noise: float(np.sum(loop.squares(noise))))
-    noise = loop.at_best_level(noise, levels)
-    smooth = np.asarray(_mean_readings(noise.on(replay), machine.plant))
-    return replace(noise, shift=loop.mean(noise) - smooth)
+    return loop.at_best_level(noise, levels), loop
 
 
 @dataclass(frozen=True)
@@ -299,11 +309,10 @@ def noisy_readings(
         log: The log of positions.
         replay: The loop without noise.
     """
-    noise = estimated_noise(machine, log, replay)
-    if noise is None:
+    found = _noise_in_loop(machine, log, replay, follows=True)
+    if found is None:
         return None
+    noise, loop = found
     assert replay.disturbance is not None, "only a loop reads its encoder"
     runs = int(np.clip(_TICKS // len(replay.disturbance), 2 * _FEWEST_PAIRS, _TOGETHER))
-    replay = replay.following(machine.parameters.places, jnp.asarray(machine.parameters.guess))
-    mean = _Loop.of(machine.plant, log, replay).mean(noise)
-    return mean, drawn_readings(noise, replay, machine.plant, runs)
+    return loop.mean(noise), drawn_readings(noise, loop.replay, machine.plant, runs)
