@@ -142,6 +142,8 @@ UNIT_OF = (
     "load_acceleration",
 )
 SIGN_OF = UNIT_OF[1:]
+# Quantities of a log that may have been logged late.
+LATE_OF = ("force",)
 # Sides of a gear at which an angle may be measured.
 SIDES = ("load", "motor")
 # Ways to resample: lines between readings, or cubic splines.

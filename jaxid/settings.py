@@ -19,6 +19,7 @@ from jaxid.names import (
     HOLDS,
     IN_LOOP,
     INERTIAL_KINDS,
+    LATE_OF,
     LOG_KINDS,
     METHODS,
     MINIMISERS,
@@ -125,6 +126,18 @@ class LogTable:
     )
     sign: Mapping[str, float | tuple[float, ...]] | None = key(
         by_quantity(sign, SIGN_OF), "1 or -1 for a quantity, or a list by column: it is multiplied", note="1"
+    )
+    delay: Mapping[str, float | tuple[float, ...]] | None = key(
+        by_quantity(number("positive"), LATE_OF),
+        "time by which a quantity was logged after it acted, or a list by column: it is shifted back",
+        unit="s",
+        note="none",
+    )
+    lag: Mapping[str, float | tuple[float, ...]] | None = key(
+        by_quantity(number("positive"), LATE_OF),
+        "time constant of a first-order low-pass that a quantity was logged through, which is undone",
+        unit="s",
+        note="none",
     )
     counts_per_revolution: ByJoint | None = key(
         by_joint(number("positive")), "counts of the encoder in a turn", note="the unit count is not used"

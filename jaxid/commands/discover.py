@@ -13,6 +13,7 @@ from jaxid.case.case import Case, CaseLike
 from jaxid.case.user_faults import named_faults
 from jaxid.commands.robot_case import implied_case
 from jaxid.consistency.absent import acts_by_position
+from jaxid.consistency.late_force import LateForce, late_force
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.naming import Found, named_at_rest
 from jaxid.discovery.final import final_machine, machine_with
@@ -44,10 +45,12 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
+from jaxid.names import HOLDS
 from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.numerics.lanes import Steps, begin, run_alone
 from jaxid.session import Logs, OpenedLog, Session, open_session
 from jaxid.session.holds import session_under_better_hold
+from jaxid.session.preparing import under_hold
 from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.solvers import SOLVERS
 
@@ -187,6 +190,7 @@ def _explore_forces(
     where = where_of(search, steps[0], session)
     final, effects = _simulable(session, search, baseline.machine, steps, most, progress)
     verdict = _verdict(effects, where, steps, search)
+    late = _late_force(session, search, baseline.machine)
 
     progress("refitting in simulation" if refit else "simulating")
     before = after = declared.result()
@@ -219,6 +223,7 @@ def _explore_forces(
         noise_floor=search.floor,
         proposals=separating,
         unseen=found.unseen,
+        late=late,
     )
 
 
@@ -243,6 +248,30 @@ def _under_better_hold(session: Session, search: Search, machine: Machine) -> Se
     whole, _ = machine_with(machine, search.superset, model.added, model.theta)
     rival = force_gap(session.fit.machine(whole), session.fit.data).rms
     return session_under_better_hold(session, found, rival)
+
+
+def _late_force(session: Session, search: Search, machine: Machine) -> LateForce | None:
+    """Return the late force that explains the log as well as the effects that were found; None if none does.
+
+    Those that shift the force in time are held against it first, then all.
+    """
+    model = search.model
+    if not model.added or session.more:
+        return None
+    whole, _ = machine_with(machine, search.superset, model.added, model.theta)
+    data, held = session.fit.data, None
+    if "hold" in session.settings:
+        held = under_hold(HOLDS[0], session.fit, session.machine).data
+    kept = [c for c in model.added if _keeps_time(cand.effect_of(search.superset, c))]
+    for beside in (kept, []) if kept else ([],):
+        if len(beside) == len(model.added):
+            continue
+        without, _ = machine_with(machine, search.superset, beside, model.theta)
+        named = [c.label for c in model.added if all(c is not b for b in beside)]
+        late = late_force(without, whole, data, named, held)
+        if late is not None:
+            return late
+    return None
 
 
 def _keeps_time(effect: Effect) -> bool:

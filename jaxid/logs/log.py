@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.errors import InputError, suggest
+from jaxid.logs.late import taken_back
 from jaxid.logs.readers import read_table
 from jaxid.logs.readers.array_files import Columns
 from jaxid.logs.readers.rows import Rows
@@ -381,6 +382,7 @@ def read_log(
     time, groups, rows, timing, others = _at_one_rate(groups, table, rows, path)
     if time.size < MINIMUM_SAMPLES:
         raise _too_short(time.size, path)
+    groups = taken_back(groups, time, table, str(path))
     return Log(
         time=time,
         hold=HOLDS[0] if table.hold is None else table.hold,

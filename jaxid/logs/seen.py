@@ -68,15 +68,21 @@ def _period(seconds: float) -> str:
 
 
 def _stated(table: LogTable | None) -> list[Sight]:
-    """Return the units that the case states."""
+    """Return the units that the case states, and how late it says that forces were logged."""
     units = {} if table is None else dict(table.units or {})
-    return [
+    seen = [
         Sight(
             "time" if q == "time" else "units",
             f"{q} is converted from {_listed(unit)}, as [log] units states",
         )
         for q, unit in units.items()
     ]
+    for key, what in (("lag", "freed from a low-pass of"), ("delay", "shifted back by")):
+        late = {} if table is None else dict(getattr(table, key) or {})
+        for q, times in late.items():
+            shown = ", ".join(_period(t) for t in (times if isinstance(times, tuple) else (times,)))
+            seen.append(Sight("time", f"{q} is {what} {shown}, as [log] {key} states"))
+    return seen
 
 
 def _listed(unit: Any) -> str:

@@ -9,6 +9,7 @@ import pytest
 
 import jaxid
 from benchmarks.unforced_arms import arm
+from jaxid.consistency.late_force import LateForce
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.gap import force_gap, gaps
@@ -268,6 +269,39 @@ def test_a_ripple_finer_than_the_encoder_is_impossible(tmp_path):
     assert remark.impossible
     assert remark.text == (
         "cogging.period = 1.00 × 10⁻⁷ m is shorter than two counts of the encoder, 2.00 × 10⁻⁶ m"
+    )
+
+
+@pytest.mark.parametrize(
+    ("load", "std", "impossible"), [(181.0, 0.1, True), (181.0, 2.0, False), (100.0, 1.0, None)]
+)
+def test_a_part_that_exceeds_the_whole_is_not_complete(tmp_path, load, std, impossible):
+    setup = slow_axis(1, duration=4.0)
+    spring = ("joint_flexibility", {"stiffness": 1e6, "damping": 100.0, "load_inertia": 100.0})
+    path = write_case(tmp_path, case_text(setup, [*DECLARED, spring], closed=False, off=1.0))
+    session = open_session(path, columns(setup))
+    free = session.machine.parameters.free
+    theta = np.array([load if f.name.endswith("load_inertia") else f.guess for f in free])
+    deviation = np.array([std if f.name.endswith("load_inertia") else 0.01 * f.guess for f in free])
+    precision = Precision(np.diag(np.square(deviation)), np.ones(len(free), bool), [], np.ones(len(free)))
+    machine = session.machine.with_estimate(theta)
+    residual = np.zeros((1, 1))
+    remarks = remarks_on(session, Estimate("", machine, theta, precision, True, "", residual, 1))
+    assert [(r.impossible, r.forbids) for r in remarks] == (
+        [] if impossible is None else [(impossible, True)]
+    )
+    assert all("is a part of the joint's inertia, and exceeds it, 180 kg" in r.text for r in remarks)
+
+
+def test_no_model_with_a_late_force_is_complete(complete):
+    late = LateForce(0.002, 0.0, np.array([1.0]), np.array([1.01]), ("joint_flexibility",), "N")
+    found = judge(complete.session, complete.estimate, complete.gaps, "found", late)
+    assert found.model_complete is None
+    assert found.findings[0].startswith(
+        "The force seems to be logged 2 ms late: that explains the log as well"
+    )
+    assert "Whether the model is complete is not known: joint_flexibility may stand for the late force." in (
+        found.findings
     )
 
 

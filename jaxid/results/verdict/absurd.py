@@ -38,12 +38,14 @@ class Remark:
         text: The remark as a sentence without its full stop.
         impossible: Whether no machine has such a value.
         contradicts: Whether it contradicts a value that the case declares, however small the residual is.
+        forbids: Whether no model with it is complete, however small the residual is.
     """
 
     name: str
     text: str
     impossible: bool = False
     contradicts: bool = False
+    forbids: bool = False
 
 
 def remarks_on(session: Session, estimate: Estimate) -> list[Remark]:
@@ -62,6 +64,7 @@ def remarks_on(session: Session, estimate: Estimate) -> list[Remark]:
         value, std, info = float(estimate.theta[k]), float(estimate.std[k]), _info(estimate.machine.plant, f)
         remark = (
             _negative(f, value, std, info)
+            or _more_than_whole(estimate, f, value, std)
             or _too_fine(session, f, value, info)
             or _too_light(f, value, known, info)
             or (f.name in declared and _at_bound(declared[f.name], value, *bounds[f.name]))
@@ -97,10 +100,42 @@ def _negative(f: Free, value: float, std: float, info: ParameterInfo | None) -> 
     if value >= 0 or not (f.sign != "free" or about_axis):
         return None
     shown = f"{f.name} = {' ± '.join(with_std(value, std))} {pretty_unit(f.unit)}".strip()
+    mass = info is not None and info.dimension == "inertia"
     if value + _SIGMAS * std >= 0:
         text = f"{shown} is negative, which no machine is: the log does not determine it"
-        return Remark(f.name, text, impossible=value + std < 0)
-    return Remark(f.name, f"{shown} is negative, which no machine is", impossible=True, contradicts=True)
+        return Remark(f.name, text, impossible=value + std < 0, forbids=mass)
+    text = f"{shown} is negative, which no machine is"
+    return Remark(f.name, text, impossible=True, contradicts=True, forbids=mass)
+
+
+def _more_than_whole(estimate: Estimate, f: Free, value: float, std: float) -> Remark | None:
+    """Question an inertia behind a spring that exceeds the inertia of its joint, of which it is a part."""
+    plant = estimate.machine.plant
+    if f.effect is None or f.path[-1] != "load_inertia" or not plant.effects[f.effect].adds_spring:
+        return None
+    whole = _inertia_at(plant, int(plant.effects[f.effect].port))
+    if value <= whole:
+        return None
+    text = (
+        f"{f.name} = {' ± '.join(with_std(value, std))} {pretty_unit(f.unit)} is a part of the joint's "
+        f"inertia, and exceeds it, {_with_unit(whole, f.unit)}"
+    )
+    return Remark(f.name, text, impossible=value - _SIGMAS * std > whole, forbids=True)
+
+
+def _inertia_at(plant: Plant, joint: int) -> float:
+    """Return the inertia of a joint, its added masses included; infinite if it varies with the position."""
+    constant = plant.own_inertia()
+    if constant is None:
+        return np.inf
+    added = [
+        float(np.sum(np.asarray(getattr(e, name))))
+        for e in plant.effects
+        if e.port == joint and not e.adds_spring
+        for name, info in parameters_of(type(e)).items()
+        if info.dimension == "inertia" and getattr(e, name) is not None
+    ]
+    return float(np.atleast_1d(np.asarray(constant))[joint]) + sum(added)
 
 
 def _too_fine(session: Session, f: Free, value: float, info: ParameterInfo | None) -> Remark | None:

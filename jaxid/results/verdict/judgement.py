@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxid.consistency.absent import known_forces
+from jaxid.consistency.late_force import LateForce
 from jaxid.consistency.law import law_of_rows
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import Gap
@@ -54,7 +55,13 @@ class Judgement:
     residuals: tuple[Residual, ...]
 
 
-def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str | None = None) -> Judgement:
+def judge(
+    session: Session,
+    estimate: Estimate,
+    gaps: Sequence[Gap],
+    search: str | None = None,
+    late: LateForce | None = None,
+) -> Judgement:
     """Judge a fit.
 
     Args:
@@ -62,6 +69,7 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
         estimate: Parameters and their precision.
         gaps: Gaps of the fitted machine, the fitted log first.
         search: Verdict of a search for missing effects; None without one.
+        late: The late force that explains the log as well as effects of the search; None if none does.
     """
     residuals = tuple(
         found
@@ -73,6 +81,8 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
         complete = None
 
     remarks = remarks_on(session, estimate)
+    doubt = _doubt(remarks, late)
+    complete = None if complete and doubt else complete
     blind = undetermined(estimate)
     identified = len(blind) < len(estimate.names) or not estimate.names
     against = [*_large_gaps(session, gaps, residuals), *_left(session, gaps)]
@@ -84,6 +94,7 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
 
     findings = _scale_words(session)
     findings += [] if estimate.converged else [f"The fit did not converge: {estimate.message}."]
+    findings += [] if late is None else late.findings
     findings += [f"The fit contradicts the case: {r.text}." for r in contrary]
     if against:
         findings.append(f"This model does not explain the log: {against[0]}")
@@ -96,7 +107,9 @@ def judge(session: Session, estimate: Estimate, gaps: Sequence[Gap], search: str
         findings.append(
             "Check first that the columns of position and force are the right ones, with sign, unit and gain."
         )
-    findings += _completeness_words(session, residuals, complete, None if doubtful else search or "none")
+    findings += _completeness_words(
+        session, residuals, complete, None if doubtful else search or "none", doubt
+    )
     findings += contradicted_file(session, estimate)
     others = [r for r in remarks if r not in (*impossible, *contrary)]
     findings += _remark_words(others)
@@ -212,15 +225,34 @@ def _drifted(session: Session, gaps: Sequence[Gap]) -> list[str]:
     return []
 
 
+def _doubt(remarks: Sequence[Remark], late: LateForce | None) -> str:
+    """Return the reason for which a model that leaves only noise is not called complete; empty if none."""
+    if late is not None:
+        return f"{' and '.join(late.effects)} may stand for the late force"
+    return next((r.text for r in remarks if r.forbids), "")
+
+
 def _completeness_words(
-    session: Session, residuals: Sequence[Residual], complete: bool | None, search: str | None
+    session: Session,
+    residuals: Sequence[Residual],
+    complete: bool | None,
+    search: str | None,
+    doubt: str = "",
 ) -> list[str]:
-    """Return the sentences on the completeness of the model; `search` is "none" if one may help."""
+    """Return the sentences on the completeness of the model.
+
+    Args:
+        session: Case and logs.
+        residuals: Comparison of the residuals with noise.
+        complete: Whether the model leaves nothing but noise.
+        search: Verdict of a search; "none" if one may help.
+        doubt: Reason for which the model is not called complete.
+    """
     if complete:
         with_it = "With what was found the" if search == "found" else "The"
         return [f"{with_it} model is complete for this log: what it leaves has the size and colour of noise."]
     if complete is None:
-        reason = next((r.reason for r in residuals if r.complete is None), "")
+        reason = next((r.reason for r in residuals if r.complete is None), doubt)
         if not reason and search == "nothing_missing":
             reason = "the residual is not quite noise, and no known effect accounts for it"
         return [

@@ -1,0 +1,232 @@
+"""A force that was logged late or through a low-pass, held against effects found in its place.
+
+A force that is read after the plant has felt it, and a spring or a lag of the drive, all turn the phase of
+the force against that of the motion. A log of many frequencies tells them apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.optimize
+from jaxtyping import Bool, Complex, Float
+
+from jaxid.consistency.balance_fit import BalanceFit, balance_fits
+from jaxid.logs.prepare import Prepared
+from jaxid.machine import Machine
+
+# Part of the gap with the effects that a late force leaves at most, to explain the log as well.
+_AS_MUCH = 1.02
+# Part of what the effects explain (in squares) that it explains at least: where they explain little, two
+# equal gaps would say nothing.
+_EXPLAINS = 0.95
+# Part of the gap as logged that it leaves at most.
+_CLEARLY = 0.9
+# A delay alone is taken unless a low-pass leaves clearly less, and that alone unless both do.
+_SIMPLER = 0.98
+# Times that are tried first, in samples of the log.
+_TRIED = 0.25 * 2.0 ** (np.arange(15) / 2.0)
+# Time constants after which a low-pass has forgotten a stop: a four-hundredth of a dry friction is left.
+_DECAYED = 6.0
+# Samples that are added at each end, which the transform joins to a circle.
+_PAD = 256
+# Largest number of kept samples: more tell a time constant no better than is needed here.
+_MOST = 8000
+
+
+@dataclass(frozen=True)
+class LateForce:
+    """A late force that explains a log as well as effects do.
+
+    Args:
+        delay: Time by which the force is logged after it acted [s].
+        lag: Time constant of the first-order low-pass that it passed on the way, zero if none [s].
+        gap: Force gap of each driven joint if the force is late, without the effects [N or N m].
+        rival: Force gap with the effects, and the force as logged.
+        effects: Names of the effects.
+        unit: Unit of the gaps.
+    """
+
+    delay: float
+    lag: float
+    gap: Float[np.ndarray, " driven"]
+    rival: Float[np.ndarray, " driven"]
+    effects: tuple[str, ...]
+    unit: str
+
+    @property
+    def keys(self) -> str:
+        """The keys of [log] that take the force back to when it acted."""
+        given = {"delay": self.delay, "lag": self.lag}
+        return " and ".join(f"{k} = {{ force = {v:.2g} }}" for k, v in given.items() if v > 0.0)
+
+    @property
+    def how(self) -> str:
+        """The way in which the force seems to be logged."""
+        late = f"{1e3 * self.delay:.2g} ms late"
+        if self.lag == 0.0:
+            return late
+        passed = f"through a low-pass with a time constant of {1e3 * self.lag:.2g} ms"
+        return passed if self.delay == 0.0 else f"{passed}, and {late}"
+
+    def json(self) -> dict[str, object]:
+        """Return the object `late_force` of discovery.json."""
+        return {
+            "delay": self.delay,
+            "lag": self.lag,
+            "gap": self.gap.tolist(),
+            "gap_with_effects": self.rival.tolist(),
+            "effects": list(self.effects),
+        }
+
+    @property
+    def findings(self) -> list[str]:
+        """Sentences on it and on what to do."""
+        named = " and ".join(self.effects)
+        worst = int(np.argmax(self.rival))
+        sizes = f"{self.gap[worst]:.3g} {self.unit}, with {named} {self.rival[worst]:.3g} {self.unit}"
+        return [
+            f"The force seems to be logged {self.how}: that explains the log as well as {named} "
+            f"{'does' if len(self.effects) == 1 else 'do'} (it leaves a force gap of {sizes}).",
+            f"If the drive logs its force so, set {self.keys} in [log], which takes it back, and search "
+            "again.",
+        ]
+
+
+def late_force(
+    machine: Machine,
+    whole: Machine,
+    data: Prepared,
+    effects: Sequence[str],
+    held: Prepared | None = None,
+) -> LateForce | None:
+    """Return the late force that explains a log as well as some effects; None if none does.
+
+    The model's force is delayed and smoothed, not the logged one undone, which would amplify its noise.
+
+    Args:
+        machine: The machine without the effects.
+        whole: The machine with them.
+        data: The prepared log.
+        effects: Their names in results.
+        held: The same log under the default hold of its force, if another one was chosen: a late force seems
+            to act earlier than a held one does. None: the log is under the default hold.
+    """
+    if not all(data.measured):
+        return None
+    driven = [int(j) for j in machine.plant.driven(machine.plant.joints)]
+    part, part_held = _longest(data), _longest(data if held is None else held)
+    now, found = (_plain(balance_fits(m, part)[0]) for m in (machine, whole))
+    late = _Reading.of(now if held is None else _plain(balance_fits(machine, part_held)[0]), part_held)
+    if not (now.finite and found.finite and late.fit.finite):
+        return None
+    late = late.beside_stops(sum(late.best()), found.counts)
+    if not late.fit.counts.any():
+        return None
+    now, found = (replace(fit, counts=late.fit.counts) for fit in (now, found))
+
+    delay, lag = late.best()
+    fits = (late.residual(delay, lag), now.fit(bounded=True)[1], found.fit(bounded=True)[1])
+    gap, before, rival = (found.rms(e)[driven] for e in fits)
+    explains = before**2 - gap**2 >= _EXPLAINS * (before**2 - rival**2)
+    if not np.all(explains & (gap <= _AS_MUCH * rival) & (gap <= _CLEARLY * before)):
+        return None
+    return LateForce(delay, lag, gap, rival, tuple(effects), machine.unit("force"))
+
+
+def _longest(data: Prepared) -> Prepared:
+    """Return the piece of a log with the most samples that count."""
+    return max(data.parts(_MOST, 1), key=lambda piece: int(piece.fitted.sum()))
+
+
+def _plain(fit: BalanceFit) -> BalanceFit:
+    """Return a balance of the declared forces alone."""
+    return replace(fit, potential=fit.potential[..., :0])
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A balance whose model is compared with a force that was read late.
+
+    Args:
+        fit: The balance.
+        model: Transform of the model's force and of its columns at the kept samples, padded, (f, n, 1 + p).
+        frequency: Frequencies of the transform [Hz], (f,).
+        period: Sampling time of the log [s].
+        kept: Time between kept samples [s].
+    """
+
+    fit: BalanceFit
+    model: Complex[np.ndarray, "f n columns"]
+    frequency: Float[np.ndarray, " f"]
+    period: float
+    kept: float
+
+    @classmethod
+    def of(cls, fit: BalanceFit, data: Prepared) -> _Reading:
+        """Transform the model of a balance."""
+        model = np.concatenate([(fit.known + fit.force)[..., None], fit.columns], axis=2)
+        padded = np.pad(model, [(_PAD, _PAD), (0, 0), (0, 0)], mode="edge")
+        kept = data.period * data.recipe.decimation
+        frequency = np.fft.rfftfreq(len(padded), kept)
+        return cls(fit, np.fft.rfft(padded, axis=0), frequency, data.period, kept)
+
+    def beside_stops(self, time: float, counts: Bool[np.ndarray, "kept n"]) -> _Reading:
+        """Return the reading at some samples only, without those to which a stop is carried by a low-pass."""
+        counts = self.fit.counts & counts
+        left = counts.copy()
+        reach = min(int(np.ceil(_DECAYED * time / self.kept)), len(left) - 1)
+        for k in range(1, reach + 1):
+            left[k:] &= counts[:-k]
+        # Before the first sample nothing is known.
+        left[:reach] = False
+        return replace(self, fit=replace(self.fit, counts=left))
+
+    def residual(self, delay: float, lag: float) -> Float[np.ndarray, "kept n"]:
+        """Return the force residual of the best fit, if the force was read late.
+
+        The low-pass is that of a drive, at the log's rate: w[k] = w[k-1] + a (u[k] - w[k-1]) with
+        a = 1 - exp(-period / lag).
+        """
+        turn = 2j * np.pi * self.frequency
+        keeps = np.exp(-self.period / lag) if lag > 0.0 else 0.0
+        passes = np.exp(-turn * delay) * (1 - keeps) / (1 - keeps * np.exp(-turn * self.period))
+        rows = len(self.fit.known) + 2 * _PAD
+        late = np.fft.irfft(self.model * passes[:, None, None], rows, axis=0)[_PAD:-_PAD]
+        read = replace(self.fit, known=late[..., 0] - self.fit.force, columns=late[..., 1:])
+        return read.fit(bounded=True)[1]
+
+    def best(self) -> tuple[float, float]:
+        """Return the delay and the time constant that leave least; one is zero if the other does as well."""
+        delay, by_delay = self._search(lambda t: (t, 0.0))
+        lag, by_lag = self._search(lambda t: (0.0, t))
+        start, size = np.array([0.5 * delay, lag]), 0.25 * max(delay, lag, self.period)
+        corners = np.abs(start + size * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, -1.0]]))
+        both = scipy.optimize.minimize(
+            lambda x: self._cost(*np.abs(x)),
+            start,
+            method="Nelder-Mead",
+            options={"initial_simplex": corners, "xatol": 0.01 * self.period, "fatol": 0.0, "maxfev": 60},
+        )
+        simple = (delay, 0.0) if by_delay <= by_lag / _SIMPLER else (0.0, lag)
+        if both.fun < _SIMPLER * min(by_delay, by_lag):
+            delay, lag = np.abs(both.x).tolist()
+            return delay, lag
+        return simple
+
+    def _search(self, times: Callable[[float], tuple[float, float]]) -> tuple[float, float]:
+        """Return the best time along one axis, and its cost."""
+        tried = np.concatenate([[0.0], _TRIED * self.period])
+        costs = [self._cost(*times(t)) for t in tried]
+        k = int(np.argmin(costs))
+        bounds = (tried[max(k - 1, 0)], tried[min(k + 1, tried.size - 1)])
+        found = scipy.optimize.minimize_scalar(
+            lambda t: self._cost(*times(t)), bounds=bounds, options={"xatol": 0.01 * self.period}
+        )
+        return (float(found.x), float(found.fun)) if found.fun < costs[k] else (float(tried[k]), costs[k])
+
+    def _cost(self, delay: float, lag: float) -> float:
+        """Return the gap of all joints, each in parts of its force."""
+        return float(np.linalg.norm(self.fit.rms(self.residual(delay, lag)) / self.fit.scale))
