@@ -34,14 +34,19 @@ _NOISY = 2.0
 _AVERAGES = (1, 2, 3, 4)
 # A longer law is named only if it leaves less than this part of what a shorter one leaves.
 _BETTER = 0.7
-# First ticks at which the memory of the law is not known.
-_SETTLING = 20
+# First ticks at which the memory of the law is not known, unless the law explains them too: to within so
+# many standard deviations of the noise.
+_SETTLING, _SETTLED = 20, 4.0
 # Largest autocorrelation of the difference between the logged command and that of the law, at lags 1 to 5, at
 # which it counts as noise of the reading; and the largest such noise, as a part of the command.
 _WHITE, _LAGS, _NOISE = 0.1, 5, 0.5
-# Standard deviation of normal noise over its median size, and the largest ratio of the difference's standard
-# deviation to that which its median implies.
-_NORMAL, _OUTLIERS = 1.4826, 1.2
+# Standard deviation of normal noise over its median size, and the largest excess of the difference's standard
+# deviation over that which its median implies.
+_NORMAL, _OUTLIERS = 1.4826, 0.2
+# Both limits of a short log: so many times the standard deviation of an autocorrelation.
+_SHORT = 4.0
+# Least number of samples by which a law is judged, in settling times.
+_JUDGED = 5
 # A difference below this part of the command is rounding.
 _ROUNDED = 1e-6
 # Part of an inertia from which a delay of the loop's velocity is said.
@@ -78,6 +83,23 @@ class LawAtTicks:
 
     command: Float[np.ndarray, "ticks m"]
     every: int
+
+
+@dataclass(frozen=True)
+class LawCommand:
+    """Command of a law that explains the logged one but for white noise of its reading.
+
+    Args:
+        command: The command at the samples of the log, (time, m).
+        offset: Standard deviation of its constant error, (m,): the mean of the noise, if the law has an
+            integral that began at an unknown value; None: it has no such error.
+        logged: Number of first samples at which the logged command stands in its place, because the law
+            began before the log.
+    """
+
+    command: Float[np.ndarray, "time m"]
+    offset: Float[np.ndarray, " m"] | None
+    logged: int
 
 
 @dataclass(frozen=True)
@@ -321,7 +343,7 @@ def _fitted_laws(machine: Machine, log: Log, drive: int) -> Iterator[tuple[int, 
             yield 3, _Fitted(text + more, remaining)
 
 
-def noise_free_command(machine: Machine, log: Log) -> Float[np.ndarray, "time m"] | None:
+def noise_free_command(machine: Machine, log: Log) -> LawCommand | None:
     """Return the command of the law if the logged one is the same but for white noise of its reading.
 
     The applied command is then known without that noise.
@@ -331,32 +353,54 @@ def noise_free_command(machine: Machine, log: Log) -> Float[np.ndarray, "time m"
         log: The log.
 
     Returns:
-        The command, (time, m); None if the law cannot be computed, if the log is slower than the loop, if the
-        law does not explain the logged command, or if it integrates.
+        The command; None if the law cannot be computed, if the log is slower than the loop, or if the law
+        does not explain the logged command.
     """
     replayed = replayed_law(machine, log)
-    if replayed is None or replayed.every > 1 or log.samples < 10 * _SETTLING:
+    if replayed is None or replayed.every > 1 or log.samples < _JUDGED * _SETTLING:
         return None
     command = replayed.command
     if not np.all(np.isfinite(command)):
         return None
-    off = (log.force - command)[_SETTLING:]
-    size, noise = np.std(log.force, axis=0), np.sqrt(np.mean(off**2, axis=0))
+    integrates = _integrates(machine.law)
+    if machine.law is not None and integrates:
+        command = _from_mean(machine.law, command, log.force)
+    off = log.force - command
+    settled = off[_SETTLING:]
+    size, noise = np.std(log.force, axis=0), np.sqrt(np.mean(settled**2, axis=0))
     if np.any(noise > _NOISE * size):
         return None
-    if np.all(noise <= _ROUNDED * size):
-        return command
-    if isinstance(machine.controller, PID) and np.any(np.asarray(machine.controller.ki) != 0):
-        # Its integral began at a value that only the mean of the noise tells: a constant force would have the
-        # error of that, and a far smaller standard deviation.
+    exact = bool(np.all(noise <= _ROUNDED * size))
+    if not exact and not _is_white(settled, noise):
         return None
+    # The mean of the noise is in the integral, which began at an unknown value.
+    offset = noise / np.sqrt(len(settled)) if integrates and not exact else None
+    if exact or np.all(np.abs(off[:_SETTLING]) <= _SETTLED * noise):
+        return LawCommand(command, offset, 0)
+    return LawCommand(np.concatenate([log.force[:_SETTLING], command[_SETTLING:]]), offset, _SETTLING)
+
+
+def _integrates(law: Controller | None) -> bool:
+    """Check that a law has an integral."""
+    return isinstance(law, PID) and bool(np.any(np.asarray(law.ki) != 0))
+
+
+def _from_mean(law: Controller, command: np.ndarray, logged: np.ndarray) -> np.ndarray:
+    """Return the command of a law whose integral begins so that the mean difference to the log is zero."""
+    limit = np.inf if law.limit is None else np.asarray(law.limit)
+    inside = (np.abs(command) < limit) & (np.arange(len(command)) >= _SETTLING)[:, None]
+    off = np.sum(np.where(inside, logged - command, 0.0), axis=0) / np.maximum(np.sum(inside, axis=0), 1)
+    return np.clip(command + off, -limit, limit)
+
+
+def _is_white(off: np.ndarray, noise: np.ndarray) -> bool:
+    """Check that the difference between a logged command and that of the law is white noise."""
+    chance = _SHORT / np.sqrt(len(off))
     # A law that is right but for a few ticks, such as a pulse that begins a tick later, leaves outliers.
     middle = _NORMAL * np.median(np.abs(off), axis=0)
-    if np.any(noise > _OUTLIERS * middle):
-        return None
-    # The mean counts too: an integral that began elsewhere, or a disturbance, is no noise.
+    if np.any(noise > (1 + max(_OUTLIERS, chance)) * middle):
+        return False
+    # The mean counts too: a disturbance is no noise.
     power = np.maximum(np.sum(off**2, axis=0), 1e-300)
     correlation = [np.sum(off[k:] * off[:-k], axis=0) / power for k in range(1, _LAGS + 1)]
-    if np.max(np.abs(correlation)) > _WHITE:
-        return None
-    return np.concatenate([log.force[:_SETTLING], command[_SETTLING:]])
+    return bool(np.max(np.abs(correlation)) <= max(_WHITE, chance))

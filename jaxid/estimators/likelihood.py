@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import jax
@@ -11,14 +11,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.consistency.law import noise_free_command
+from jaxid.consistency.law import LawCommand, noise_free_command
 from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.estimators.innovations import Innovations
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.balance import Balance
-from jaxid.simulation.kalman import make_filter, slow_samples, smooth_steps
+from jaxid.numerics.affine import depends
+from jaxid.simulation.kalman import KalmanFilter, make_filter, slow_samples, smooth_steps
 from jaxid.simulation.replay import Numerics, exact_numerics
 from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import needed_steps
@@ -27,14 +28,19 @@ from jaxid.simulation.step_size import needed_steps
 _FORCE_NOISE = 0.1
 # Lowest noise of the force in turn, as a part of it. The likelihood of a machine without noise is a narrow
 # curved valley: a fit at a higher noise leads close to its floor. The last one is below any drive's noise,
-# and above the error of the steps at reversals.
-_FLOORS = (1e-2, 1e-3, 1e-4)
+# and above the error of the steps at reversals, which is larger where joints push each other or friction
+# changes with speed.
+_FLOORS, _LOWEST = (1e-2, 1e-3, 1e-4), 1e-5
 # Largest noise of the force, as a part of it; noise of a reading, as a multiple of its first estimate.
 _MOST, _READING_RANGE = 1e2, (1e-3, 1e3)
 # Noise of the force, as a part of it, below which sticking is certain.
 _QUIET = 1e-3
-# Steps of the last fit of such a log for each one before, and least number with a lag in the drive.
-_FINER = 4
+# First samples of a log with dry friction: a filter that begins with the wrong direction of motion takes the
+# friction for certain, and keeps its error.
+_BEGINS = 4
+# Steps of the last fit of such a log for each one before, and least number with a lag in the drive; and those
+# of friction that changes with speed: four moved the speed of a Stribeck curve in a chain by 3.6e-4, 6 sigma.
+_FINER, _FINEST = 4, 16
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,10 @@ class Likelihood:
         machine: The machine at its guesses.
         log: The log, whose force is the command that drives the filter.
         numerics: Settings of the integration.
-        applied: Command of the declared law, if it explains the logged one; None: the logged one drives.
+        law: Command of the declared law, if it explains the logged one; None: the logged one drives.
+        unsure: Mask of the first samples, which never count, (time, n); None: all may count. With dry
+            friction the velocity at the start is not known well enough. A logged command that stands in
+            place of that of the law has the noise of its reading.
         slow: Mask of the samples at rest, which do not count; None: all count.
         force: Size of the logged force, (m,).
         noise: Logarithms of the noise at the start, of the force and then of the readings, (m + k,).
@@ -57,7 +66,8 @@ class Likelihood:
     machine: Machine
     log: Log
     numerics: Numerics
-    applied: np.ndarray | None
+    law: LawCommand | None
+    unsure: np.ndarray | None
     slow: np.ndarray | None
     force: np.ndarray
     noise: np.ndarray
@@ -72,10 +82,11 @@ class Likelihood:
     def at_rest_too(self, problem: Innovations) -> Innovations:
         """Return the likelihood with the samples at rest."""
         # So precise a fit shows the error of a step in which a joint comes to rest.
-        finer = replace(self.numerics, substeps=_FINER * self.numerics.substeps)
-        kalman = make_filter(self.machine, self.log, finer)
-        counts = np.asarray(kalman.used)[:: kalman.every][:, list(self.log.measured)]
-        return problem._replace(kalman=kalman, counts=counts)
+        more = _FINEST if _friction_follows_speed(self.machine, self.log) else _FINER
+        finer = replace(self.numerics, substeps=more * self.numerics.substeps)
+        offset = None if self.law is None else self.law.offset
+        kalman = make_filter(self.machine, self.log, finer, self.unsure, offset)
+        return problem._replace(kalman=kalman, counts=_counted(kalman, self.log, self.unsure))
 
 
 def likelihood_of(
@@ -94,14 +105,16 @@ def likelihood_of(
     if numerics is None:
         numerics = needed_numerics(machine, log, start)
     parameters, measured = machine.parameters, list(log.measured)
-    applied = noise_free_command(machine, log)
-    driven = log if applied is None else replace(log, force=applied)
+    law = noise_free_command(machine, log)
+    driven = log if law is None else replace(log, force=law.command)
     slow = None
     if rest_velocity is not None and slides(machine, log):
         slow = slow_samples(log, rest_velocity)
-    kalman = make_filter(machine, driven, numerics, slow)
-    counts = np.asarray(kalman.used)[:: kalman.every]
-    counts = (counts if slow is None else counts & ~slow)[:, measured]
+    unsure = _unsure_start(log, _BEGINS if slow is not None else 0, 0 if law is None else law.logged)
+    if unsure is not None:
+        slow = unsure if slow is None else slow | unsure
+    kalman = make_filter(machine, driven, numerics, slow, None if law is None else law.offset)
+    counts = _counted(kalman, log, slow)
     if counts.sum() < 5 * len(parameters.free):
         slowest = 0.0 if rest_velocity is None else np.min(rest_velocity)
         raise InputError(
@@ -114,7 +127,9 @@ def likelihood_of(
     stroke = np.maximum(np.ptp(log.readings, axis=0), 1e-300)
     reading = np.maximum(position_noise(machine, log), 1e-9 * stroke)[measured]
     noise = np.log(np.concatenate([_FORCE_NOISE * force, reading]))
-    floors = [np.log(np.concatenate([f * force, _READING_RANGE[0] * reading])) for f in _FLOORS]
+    rough = machine.plant.coupled or _friction_follows_speed(machine, log)
+    lowest = _FLOORS if rough else (*_FLOORS, _LOWEST)
+    floors = [np.log(np.concatenate([f * force, _READING_RANGE[0] * reading])) for f in lowest]
     problem = Innovations(
         kalman=kalman,
         places=parameters.places,
@@ -130,12 +145,34 @@ def likelihood_of(
         machine=machine,
         log=driven,
         numerics=numerics,
-        applied=applied,
+        law=law,
+        unsure=unsure,
         slow=slow,
         force=force,
         noise=noise,
         floors=floors,
     )
+
+
+def _unsure_start(log: Log, *first: int) -> np.ndarray | None:
+    """Return the mask of the largest number of first samples, (time, n); None for none."""
+    if not any(first):
+        return None
+    unsure = np.zeros(log.position.shape, bool)
+    unsure[: max(first)] = True
+    return unsure
+
+
+def _counted(kalman: KalmanFilter, log: Log, left_out: np.ndarray | None) -> np.ndarray:
+    """Return the mask of the innovations that count, (time, k).
+
+    Args:
+        kalman: The filter.
+        log: Its log.
+        left_out: Mask of the samples that do not count, (time, n); None: all may count.
+    """
+    counts = np.asarray(kalman.used)[:: kalman.every]
+    return (counts if left_out is None else counts & ~left_out)[:, list(log.measured)]
 
 
 def needed_numerics(machine: Machine, log: Log, start: np.ndarray | None) -> Numerics:
@@ -169,11 +206,24 @@ def _force_scale(machine: Machine, log: Log) -> Float[np.ndarray, " m"]:
 
 def slides(machine: Machine, log: Log) -> bool:
     """Check that dry friction acts somewhere."""
+    # Shapes tell: no operation is compiled.
+    balance = _balance(machine, log)
+    return bool(jax.eval_shape(balance, jnp.zeros_like(log.filled[0])).slides)
+
+
+def _friction_follows_speed(machine: Machine, log: Log) -> bool:
+    """Check that a level of dry friction changes with the velocity."""
+    balance = _balance(machine, log)
+    still = jnp.zeros_like(log.filled[0])
+    return depends(lambda qd: [getattr(balance(qd), level) for level in ("dry", "stick")], (still,))
+
+
+def _balance(machine: Machine, log: Log) -> Callable[[Array], Balance]:
+    """Return the balance at the first sample as a function of the velocity, (n,)."""
     plant = machine.plant
 
-    def balance(q: Array, u: Array) -> Balance:
-        zero = jnp.zeros_like(q)
-        return plant.balance(q, zero, zero, u, jnp.zeros(()), plant.initial_states(u))
+    def balance(qd: Array) -> Balance:
+        q, u = jnp.asarray(log.filled[0]), jnp.asarray(log.force[0])
+        return plant.balance(q, qd, jnp.zeros_like(q), u, jnp.zeros(()), plant.initial_states(u))
 
-    # Shapes tell: no operation is compiled.
-    return bool(jax.eval_shape(balance, log.filled[0], log.force[0]).slides)
+    return balance

@@ -67,8 +67,9 @@ def prediction_error(
 
     An extended Kalman filter on the plant's step, driven by the logged command, predicts each reading from
     those before it. In open loop and in a loop the estimate is the same function of the log, because the
-    command is measured. If the declared law has no integral and explains the logged command but for white
-    noise of its reading, the command of the law is used.
+    command is measured. If the declared law explains the logged command but for white noise of its reading,
+    the command of the law is used; if it has an integral, which began at an unknown value, that command has a
+    constant error, whose distribution the filter takes into account.
 
     Args:
         machine: The machine. Its sensor gives the first values of the noise. If links must be those of real
@@ -339,7 +340,7 @@ def _corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[tuple[np.ndarr
     reads, rng = [], np.random.default_rng(0)
     for member, place in zip(fit.members, fit.places, strict=True):
         p, drives, own = member.unknowns, member.drives, x[place].copy()
-        known = member.command_noise is None or member.at.applied is not None
+        known = member.command_noise is None or member.at.law is not None
         stated = np.zeros(drives) if known or member.command_noise is None else member.command_noise
         read = np.minimum(stated, np.exp(own[p : p + drives]))
         reads.append(read)
@@ -402,7 +403,7 @@ def _estimate(fit: JointLikelihood, end: Maximum, theta: np.ndarray, reads: Sequ
 
     each = " for each log," if several else ""
     notes = [f"noise of the force and of the readings was estimated{each} with the unknowns"]
-    by_law = [m.part.name for m in fit.members if m.at.applied is not None]
+    by_law = [m.part.name for m in fit.members if m.at.law is not None]
     if by_law:
         where = f" (in {', '.join(by_law)})" if several else ""
         notes.append(

@@ -49,6 +49,7 @@ class KalmanFilter(eqx.Module):
         start: Position and velocity before the first reading, (2 n,).
         spread: Standard deviations of `start`, (2 n,).
         measured: Joints with an encoder.
+        offset: Standard deviation of a constant error of the command, (m,); None: it has none.
         every: Number of ticks per sample of the log.
         of_velocity: Whether the readings are velocities.
     """
@@ -61,6 +62,7 @@ class KalmanFilter(eqx.Module):
     places: Float[Array, "time n"]
     start: Float[Array, " 2n"]
     spread: Float[Array, " 2n"]
+    offset: Float[Array, " m"] | None
     measured: tuple[int, ...] = eqx.field(static=True)
     every: int = eqx.field(static=True)
     of_velocity: bool = eqx.field(static=True, default=False)
@@ -90,10 +92,15 @@ class KalmanFilter(eqx.Module):
         size, m = x.size, before.shape[1]
         moving, speeds = jnp.arange(2 * n), n + jnp.arange(n)
         jolts = self._jolts(plant)
-        p = jnp.zeros((size, size)).at[moving, moving].set(self.spread**2)
-
         advance = drive.stepper(plant, x0, (before[0],) if held else (before[0], after[0]))
         force_variance, reading_variance = (drive.gain * force_noise) ** 2, reading_noise**2
+
+        # A constant error of the force follows the plant's states.
+        whole = size if self.offset is None else size + m
+        x, p = jnp.pad(x, (0, whole - size)), jnp.zeros((whole, whole)).at[moving, moving].set(self.spread**2)
+        if self.offset is not None:
+            errors = size + jnp.arange(m)
+            p = p.at[errors, errors].set((drive.gain * self.offset) ** 2)
 
         def tick(carry: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
             x, p = carry
@@ -109,12 +116,15 @@ class KalmanFilter(eqx.Module):
                 variances.append(s)
 
             def step(z: Array) -> tuple[Array, Array]:
-                ends = (u0 + z[size:],) if held else (u0 + z[size:], u1 + z[size:])
-                new = ravel_pytree(advance(unravel(jnp.asarray(z[:size])), ends, t))[0]
+                state, error, noise = z[:size], z[size:whole], z[whole:]
+                force = noise if self.offset is None else error + noise
+                ends = (u0 + force,) if held else (u0 + force, u1 + force)
+                new = ravel_pytree(advance(unravel(jnp.asarray(state)), ends, t))[0]
+                new = new if self.offset is None else jnp.concatenate([new, error])
                 return new, new
 
             jacobian, x = jax.jacfwd(step, has_aux=True)(jnp.concatenate([x, jnp.zeros(m)]))
-            a, b = jacobian[:, :size], jacobian[:, size:]
+            a, b = jacobian[:, :whole], jacobian[:, whole:]
             p = a @ p @ a.T + (b * force_variance) @ b.T
             p = p.at[speeds, speeds].add(jolt) if jolt.ndim == 1 else p.at[n : 2 * n, n : 2 * n].add(jolt)
             return (x, 0.5 * (p + p.T)), (jnp.stack(innovations), jnp.stack(variances))
@@ -150,7 +160,11 @@ class KalmanFilter(eqx.Module):
 
 
 def make_filter(
-    machine: Machine, log: Log, numerics: Numerics, slow: np.ndarray | None = None
+    machine: Machine,
+    log: Log,
+    numerics: Numerics,
+    slow: np.ndarray | None = None,
+    offset: np.ndarray | None = None,
 ) -> KalmanFilter:
     """Prepare a log for the Kalman filter of its machine.
 
@@ -160,6 +174,7 @@ def make_filter(
         numerics: Settings of the integration.
         slow: Mask of the samples at which the model is not to predict the velocity, see `slow_samples`,
             (time, n); None: it always does.
+        offset: Standard deviation of a constant error of the command, (m,); None: it has none.
     """
     # The command is the logged one: no law is needed.
     replay = make_replay(replace(machine, controller=None), log, numerics)
@@ -188,6 +203,7 @@ def make_filter(
         places=log.filled,
         start=np.concatenate([replay.position, replay.velocity]),
         spread=np.concatenate([unsure, speed]),
+        offset=offset,
         measured=tuple(np.flatnonzero(log.measured).tolist()),
         every=every,
         of_velocity=log.integrated,

@@ -4,6 +4,7 @@ import dataclasses
 import re
 import tomllib
 
+import numpy as np
 import pytest
 
 from jaxid.consistency.law import noise_free_command
@@ -81,9 +82,18 @@ def test_a_log_of_one_tick_in_ten_is_replayed_between_its_samples(runs):
         opened(slow, LAWS["pd"], "pd")
 
 
-@pytest.mark.parametrize(("loop", "known"), [("cascade_pd", True), ("pid", False)])
-def test_a_noisy_command_of_a_law_with_an_integral_is_taken_as_it_was_read(loop, known):
-    """Its integral began anywhere: what only the mean of the noise tells made constant_force 44 sigma off."""
-    run = setup(loop, 0.03).run()
+@pytest.mark.parametrize(("loop", "integral"), [("cascade_pd", False), ("pid", True)])
+def test_a_noisy_command_is_replaced_by_that_of_its_law(loop, integral):
+    """The integral of a law began anywhere: the mean of the noise tells where, and its error is stated."""
+    applied, run = setup(loop, 0.0).run()["force"], setup(loop, 0.03).run()
     session = opened({column: run[field] for column, field in NAMES.items()}, LAWS[loop], loop)
-    assert (noise_free_command(session.machine, session.fit.log) is not None) == known
+    found = noise_free_command(session.machine, session.fit.log)
+    assert found is not None
+    error = (found.command - applied.reshape(found.command.shape))[found.logged :]
+    if integral:
+        assert np.ptp(error) < 1e-6
+        assert found.offset == pytest.approx(0.03 / np.sqrt(len(error)), rel=0.05)
+        assert abs(error.mean()) < 3 * found.offset
+    else:
+        assert found.offset is None
+        assert np.abs(error).max() < 1e-6

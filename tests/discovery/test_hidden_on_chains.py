@@ -5,6 +5,7 @@ import tomllib
 import numpy as np
 import pytest
 
+import jaxid
 from benchmarks.hidden_run import logged
 from jaxid.commands.discover import discover, start_search, where_of
 from jaxid.discovery import candidates as cand
@@ -215,3 +216,17 @@ def test_break_away_friction_is_told_from_its_neighbours(tmp_path):
     found = discover(write_case(tmp_path, text_of(case)), logged(case), refit=False)
     assert [e.label for e in found.effects] == ["static_friction[2]"]
     assert found.after.value("static_friction[2].level") == pytest.approx(6.0, rel=0.15)
+
+
+@pytest.mark.slow
+def test_a_stribeck_curve_in_a_chain_has_intervals_that_hold():
+    """With four steps a sample in the last fit the speed of the curve was 6 sigma off."""
+    case = next(c for c in cases("fresh") if c.seed == 5013)
+    kind, mass = next(place for place in case.effects if place not in case.declared)
+    true = case.effects[kind, mass]
+    lines = [f"{name} = {{ guess = {1.3 * value!r} }}" for name, value in true.items()]
+    text = "\n".join([text_of(case), "[[effects]]", f'kind = "{kind}"', f"joint = {mass}", *lines])
+    fit = jaxid.identify(tomllib.loads(text), logged(case), method="prediction_error").estimate
+    assert fit.converged
+    off = fit.theta - [case.truth[name] for name in fit.names]
+    assert np.all(np.abs(off) < 3.5 * fit.std)

@@ -22,6 +22,7 @@ from tests.support.axis_log import log_of
 from truth.axis.cases import case_text, write_case
 from truth.axis.machines import EMPS_ACCELERATION, EMPS_LOOP, Setup, emps_like, moves, multisine
 from truth.axis.stepper import Loop, Machine, Sensor
+from truth.hidden.cases import cases
 
 TRUE = np.array([95.1, 203.5, 20.39])
 LOGS = 6
@@ -88,6 +89,33 @@ def test_a_delay_of_a_part_of_a_sample_leaves_the_inertia_right():
     fit = jaxid.identify(case, log, method="prediction_error").estimate
     assert abs(fit.theta[0] / true[0] - 1) < 1e-5
     assert np.all(np.abs(fit.theta - true) < 3.5 * fit.std)
+
+
+def test_the_first_samples_of_a_log_with_dry_friction_do_not_count(tmp_path):
+    """With the wrong direction of motion the filter took the friction for certain: 9 sigma off."""
+    session = open_session(*opened(tmp_path, 1, closed=False))
+    rest = np.asarray(session.fit.data.recipe.rest_velocity)
+    made = likelihood_of(session.machine, session.fit.log, rest_velocity=rest)
+    rested = made.at_rest_too(made.problem)
+    for counts in (made.problem.counts, rested.counts):
+        assert not counts[:4].any()
+    assert rested.counts[4:].all()
+
+
+@pytest.mark.slow
+def test_a_force_beside_a_law_with_an_integral_has_intervals_that_hold():
+    """What the mean of the noise tells of the integral made the constant force 23 and 44 sigma off."""
+    z = []
+    for case in (c for c in cases("fresh") if c.seed in (12076, 12202)):
+        setup = case.setup()
+        run = setup.run()
+        text = case_text(setup, [*case.values.items()], off=1.3, motion=case.size.motion, sensor=case.sensor)
+        log = {"t": run["t"], "q": run["position"], "u": run["force"], "ref": run["reference"]}
+        fit = jaxid.identify(tomllib.loads(text), log, method="prediction_error").estimate
+        assert any("declared law" in note for note in fit.notes)
+        z += [(fit.value(n) - case.truth[n]) / std for n, std in zip(fit.names, fit.std, strict=True)]
+    assert len(z) == 9
+    assert np.abs(z).max() < 3.5
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
+from jaxid.consistency.law import noise_free_command
 from jaxid.dynamics.residuals import integrate_internal_states
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
@@ -19,9 +20,7 @@ from jaxid.model.plant import Plant
 from jaxid.numerics import filters as signals
 from jaxid.numerics.kept import kept_jit
 from jaxid.session import OpenedLog
-from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.force_balance import ForceData
-from jaxid.simulation.law_replay import commands
 
 # Readings that agree within this range, in standard deviations of their noise, count as a rest: noise alone
 # exceeds it once in a thousand times. A rest needs more agreeing readings than a reversal without sticking
@@ -34,10 +33,6 @@ _LONGEST = 60
 _AFTER = 12
 # Largest number of starts, of all logs and joints together.
 _MOST = 192
-# The controller's law replaces the logged command if it reproduces it to within this many deviations of its
-# noise, or this part of its RMS.
-_SAME = 1.5
-_NEARLY = 0.02
 # Median of the square of a standard normal variable.
 _MEDIAN_OF_SQUARE = 0.4549
 
@@ -105,7 +100,7 @@ def starts_from_rest(
     logs = [
         (
             _internal_states(machine.plant, ForceData.of(r.data)),
-            replace(r.log, force=_applied_command(r.machine(machine), r.log)[0]),
+            replace(r.log, force=_applied_command(r.machine(machine), r.log)),
             r.data,
         )
         for r in runs
@@ -221,7 +216,7 @@ def force_noise_at_rest(machine: Machine, log: Log, starts: Starts, joint: int) 
     """
     driven = machine.plant.driven(log.position.shape[1])
     drives = np.flatnonzero(np.asarray(driven) == joint)
-    if not drives.size or _applied_command(machine, log)[1][drives[0]]:
+    if not drives.size or noise_free_command(machine, log) is not None:
         return 0.0
     readings = np.asarray(starts.command)[:, : int(starts.still), drives[0]]
     curved = np.diff(readings, n=2, axis=1)
@@ -230,22 +225,10 @@ def force_noise_at_rest(machine: Machine, log: Log, starts: Starts, joint: int) 
     return float(np.sqrt(variance) * abs(np.asarray(machine.gain)[drives[0]]))
 
 
-def _applied_command(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarray]:
-    """Return the command without the noise of the log, and whether the law gives it, by drive.
+def _applied_command(machine: Machine, log: Log) -> np.ndarray:
+    """Return the command without the noise of the log, if the declared law explains it, else the logged one.
 
-    A single noisy sample above the level at a start would set the simulation in motion. The logged command is
-    returned if there is no controller, or one that does not reproduce it.
+    A single noisy sample above the level at a start would set the simulation in motion.
     """
-    law = machine.law
-    if law is None or log.reference is None:
-        return log.force, np.zeros(log.force.shape[1], bool)
-    extra = disturbance_at(machine.disturbance, log.time, log)
-    arrays = (log.position, log.reference, np.broadcast_to(extra, log.force.shape))
-    driven = machine.plant.driven(log.position.shape[1])
-    made = np.asarray(commands(law, driven, *arrays))
-    size = np.sqrt(np.mean(log.force**2, axis=0))
-    stated = machine.sensor.force_noise
-    noise = 0.0 if stated is None else np.asarray(stated)
-    off = np.sqrt(np.mean((made - log.force) ** 2, axis=0))
-    same = off <= np.maximum(_SAME * noise, _NEARLY * size)
-    return np.where(same, made, log.force), same
+    law = noise_free_command(machine, log)
+    return log.force if law is None else law.command
