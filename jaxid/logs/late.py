@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import scipy.interpolate
 from jaxtyping import Float
 
 from jaxid.errors import InputError
@@ -64,6 +63,8 @@ def _earlier(time: np.ndarray, x: np.ndarray, delay: float, hold: str | None) ->
     then = np.minimum(time + delay, time[-1])
     if hold in (None, "zero_order"):
         return np.interp(then, time, x)
+    import scipy.interpolate  # a third of a second, which reading another log does not need
+
     return scipy.interpolate.CubicSpline(time, x)(then)
 
 
