@@ -38,8 +38,9 @@ _QUIET = 1e-3
 # First samples of a log with dry friction: a filter that begins with the wrong direction of motion takes the
 # friction for certain, and keeps its error.
 _BEGINS = 4
-# Steps of the last fit of such a log for each one before, and least number with a lag in the drive; and those
-# of friction that changes with speed: four moved the speed of a Stribeck curve in a chain by 3.6e-4, 6 sigma.
+# Steps of the last fit of such a log for each one before, and least number with a lag in the drive. The last
+# number is the least one of the last fit where friction changes with speed: four moved the speed of a
+# Stribeck curve in a chain by 3.6e-4, 6 sigma.
 _FINER, _FINEST = 4, 16
 
 
@@ -82,8 +83,10 @@ class Likelihood:
     def at_rest_too(self, problem: Innovations) -> Innovations:
         """Return the likelihood with the samples at rest."""
         # So precise a fit shows the error of a step in which a joint comes to rest.
-        more = _FINEST if _friction_follows_speed(self.machine, self.log) else _FINER
-        finer = replace(self.numerics, substeps=more * self.numerics.substeps)
+        steps = _FINER * self.numerics.substeps
+        if _friction_follows_speed(self.machine, self.log):
+            steps = max(steps, _FINEST)
+        finer = replace(self.numerics, substeps=steps)
         offset = None if self.law is None else self.law.offset
         kalman = make_filter(self.machine, self.log, finer, self.unsure, offset)
         return problem._replace(kalman=kalman, counts=_counted(kalman, self.log, self.unsure))
