@@ -70,6 +70,8 @@ class Candidate:
         neutral: Values at which it has next to no effect.
         starts: Values from which a search starts, (starts, parameters).
         amplitude: Mask of its parameters that scale with its strength; none for a drive effect.
+        finer_starts: Values from which it starts where nothing else explains the log, (more, parameters);
+            None: there are none.
     """
 
     kind: str
@@ -79,6 +81,7 @@ class Candidate:
     neutral: np.ndarray
     starts: np.ndarray
     amplitude: np.ndarray
+    finer_starts: np.ndarray | None = None
 
     @property
     def has_grid(self) -> bool:
@@ -87,6 +90,12 @@ class Candidate:
         An effect in the drive is not: what it does depends on the force at hand.
         """
         return len(self.starts) > _FEW and bool(self.amplitude.any())
+
+    def finer(self) -> Candidate:
+        """Return the candidate with its finer starts, if it has any, after the others."""
+        if self.finer_starts is None:
+            return self
+        return replace(self, starts=np.concatenate([self.starts, self.finer_starts]), finer_starts=None)
 
     def probe(self, start: int) -> np.ndarray:
         """Return the values at which its columns are computed: the shape of a start at a faint strength."""

@@ -62,7 +62,7 @@ class ForceDomain:
     """
 
     superset: cand.CandidateModel
-    _grids: dict[tuple[str, int], list[cand.Point]] = field(default_factory=dict, compare=False)
+    _grids: dict[tuple[str, int, int], list[cand.Point]] = field(default_factory=dict, compare=False)
 
     def evaluate(
         self, samples: Any, theta: np.ndarray, wanted: Wanted = None
@@ -82,7 +82,7 @@ class ForceDomain:
 
     def grid(self, candidate: cand.Candidate, samples: Any) -> list[cand.Point]:
         """Linearise a candidate at its many starts; the result is kept, since no other effect enters it."""
-        key = (candidate.kind, candidate.port)
+        key = (candidate.kind, candidate.port, len(candidate.starts))
         if key not in self._grids:
             self._grids[key] = cand.grid_points(self.superset, candidate, samples)
         return self._grids[key]

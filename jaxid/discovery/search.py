@@ -103,6 +103,7 @@ class Search:
         self.acceptance = self._acceptance()
         self.domain: Domain = self.acceptance.domain
         self.samples = self.acceptance.samples
+        self.candidates = self.superset.candidates
         self.model = Model((), self.superset.neutral)
         # The largest threshold so far, by which effects are dropped later.
         self.limit = 0.0
@@ -152,10 +153,19 @@ class Search:
         """Return a screen with what candidates gain far from the model; here they stay near it."""
         return screened
 
+    def finer(self, model: Model) -> bool:
+        """Give the candidates their finer starts, and return whether that may explain what a model leaves."""
+        if self.acceptance.at_floor(model.theta):
+            return False
+        rest = self.rest(model)
+        before = self.candidates
+        self.candidates = tuple(c.finer() if any(c is r for r in rest) else c for c in before)
+        return any(now is not c for now, c in zip(self.candidates, before, strict=True))
+
     def rest(self, model: Model | None = None) -> list[cand.Candidate]:
         """Return the candidates that a model, by default the current one, may still get."""
         gone = [*(self.model if model is None else model).added, *self.barred]
-        return [c for c in self.superset.candidates if all(c is not g for g in gone)]
+        return [c for c in self.candidates if all(c is not g for g in gone)]
 
     def run(
         self, most: int, at_once: Callable[[Search, list[Step]], list[Step]] = lambda search, steps: steps
@@ -216,6 +226,8 @@ class Search:
         while True:
             best, scores, limit = self.best(model, ahead=len(model.added) + 2 <= most)
             self.limit = max(self.limit, limit)
+            if not best and len(model.added) < most and self.finer(model):
+                continue
             if not best or len(model.added) >= most:
                 steps.append(self.step(model, scores=scores, threshold=limit))
                 return model, steps

@@ -165,12 +165,18 @@ def _candidate(cls: type[Effect], place: str, port: int, index: np.ndarray, scal
     """Describe one effect at one port as a candidate."""
     neutral, infos = cls.neutral(scales), parameters_of(cls)
     names = [n for n in infos if n in neutral]
+
+    def values(starts: list[dict[str, float]]) -> np.ndarray:
+        return np.asarray([[s[n] for n in names] for s in starts], float)
+
+    finer = cls.finer_starts(scales)
     return Candidate(
         kind=cls.kind,
         label=place,
         port=port,
         index=index,
         neutral=np.asarray([neutral[n] for n in names], float),
-        starts=np.asarray([[s[n] for n in names] for s in cls.starts(scales)], float),
+        starts=values(cls.starts(scales)),
         amplitude=np.asarray([cls.adds_force and carries_force(infos[n]) for n in names]),
+        finer_starts=values(finer) if finer else None,
     )

@@ -136,15 +136,24 @@ class Cogging(Effect):
 
     @classmethod
     def starts(cls, scales: Scales) -> list[dict[str, float]]:
-        # Neighbouring periods differ by half a turn over the stroke, or a true ripple would fall between
-        # them: the grid is uniform in turns per stroke. Of three phases one has the right sign and at least
-        # half of the amplitude. Below two turns a ripple imitates any smooth force of position.
-        return [
-            {"amplitude": scales.force, "period": 2 * scales.position / turns, "phase": phase}
-            for turns in np.arange(2.0, 60.0, 0.5)
-            for phase in (0.0, 2 / 3 * np.pi, 4 / 3 * np.pi)
-        ]
+        # Below two turns over the stroke a ripple imitates any smooth force of position.
+        return _ripples(scales, 2.0, 60.0)
+
+    @classmethod
+    def finer_starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return _ripples(scales, 60.0, 400.0)
 
     @classmethod
     def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
         return {"period": (0.0, 1.2 * scales.position)}
+
+
+def _ripples(scales: Scales, least: float, most: float) -> list[dict[str, float]]:
+    """Return starts of a ripple with least to most turns over the stroke."""
+    # Neighbouring periods differ by half a turn over the stroke, or a true ripple would fall between them.
+    # Of three phases one has the right sign and at least half of the amplitude.
+    return [
+        {"amplitude": scales.force, "period": 2 * scales.position / turns, "phase": phase}
+        for turns in np.arange(least, most, 0.5)
+        for phase in (0.0, 2 / 3 * np.pi, 4 / 3 * np.pi)
+    ]

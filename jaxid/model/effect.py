@@ -234,6 +234,15 @@ class Effect(eqx.Module):
         return [{n: scales.natural(i.dimension) for n, i in own if not i.optional}]
 
     @classmethod
+    def finer_starts(cls, scales: Scales) -> list[dict[str, float]]:
+        """Return further values from which a search starts where nothing else explains the log.
+
+        They are for shapes so many that every search would pay for them (a ripple of hundreds of periods).
+        A search in simulated loops does not use them.
+        """
+        return []
+
+    @classmethod
     def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
         """Return the bounds within which a search keeps a parameter, in addition to its sign.
 

@@ -15,8 +15,15 @@ from truth.axis.machines import Setup
 from truth.hidden.machines import COARSE, SCALES, Scale, coarse_setup
 
 NOISES = (0.3, 1.0, 3.0)
-# "seen" and "seen_too" were test splits once; what they showed has been mended since.
-FIRST_SEED = {"calibrate": 1000, "seen": 2000, "seen_too": 6000, "test": 8000, "fresh": 12_000}
+# All but "calibrate" and "last" were test splits once: faults that they showed have been repaired since.
+FIRST_SEED = {
+    "calibrate": 1000,
+    "seen": 2000,
+    "seen_too": 6000,
+    "test": 8000,
+    "fresh": 12_000,
+    "last": 14_000,
+}
 Values = dict[str, float]
 
 

@@ -427,6 +427,10 @@ class LoopSearch(Search):
         answered = float(np.sum(np.where(counts, np.mean(np.square(drawn), axis=0), 0.0)))
         return max(self.acceptance.noise, answered)
 
+    def finer(self, model: Model) -> bool:
+        """Return False: each start is a simulation here."""
+        return False
+
     def renewed(self, model: Model) -> Model:
         """Return a model refitted from many starts, with the noise of the encoder as it is beside it."""
         index = self.fitted_by(model.added)
