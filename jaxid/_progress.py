@@ -17,7 +17,7 @@ from jaxid.files import write_whole
 # Commands whose durations are remembered, and the file that holds them.
 _MOST = 300
 _FILE = "durations.json"
-# Time between two drawings [s], and time below which a duration is not worth a word.
+# Time between two drawings [s], and time below which no duration is shown.
 _TICK, _SHORT = 0.25, 3.0
 
 

@@ -172,8 +172,7 @@ def simulation_of_log(machine: Machine, log: Log) -> SimulationGap | None:
     """Simulate a log; in a loop, also from rest if the error of the start shows, and return the smaller gap.
 
     The start's velocity is that of a parabola through the first readings, which is wrong if a log begins with
-    a
-    jerk: six masses that start from rest were off by up to half a millimetre, whatever the parameters.
+    a jerk: six masses that start from rest were off by up to half a millimetre, whatever the parameters.
     """
     gap = simulated(machine, log)
     if gap is None or gap.command is None:

@@ -73,7 +73,8 @@ class Member:
             scale: Natural sizes of the unknowns of all logs.
         """
         slopes = self.part.widened(self.slopes(scored), scale.size)
-        effect = np.linalg.norm((slopes * scale).reshape(scored.z.size, -1), axis=0)
+        with np.errstate(invalid="ignore", over="ignore"):  # if an unknown ran away, the estimate says so
+            effect = np.linalg.norm((slopes * scale).reshape(scored.z.size, -1), axis=0)
         largest = float(np.max(effect, initial=0.0))
         return Rows(slopes, np.asarray(scored.z), np.asarray(self.problem.counts), largest)
 

@@ -170,7 +170,7 @@ class UnforcedDesign:
         """Return a deviation over the value, or with its unit if the value is zero."""
         unknown = self.machine.parameters.free[k]
         if not np.isfinite(std[k]):
-            return "not told"
+            return "not identifiable"
         if unknown.guess == 0:
             return f"{std[k]:.2g} {unknown.unit}"
         return f"{std[k] / abs(unknown.guess):.2%}"
@@ -195,8 +195,8 @@ class UnforcedDesign:
 
     def _all(self, std: np.ndarray) -> str:
         """Return the deviations of all unknowns that are not stated, in a line."""
-        told = [k for k in range(len(std)) if np.isfinite(std[k])]
-        return ", ".join(f"{self.machine.parameters.names[k]} {self._part(std, k)}" for k in told)
+        known = [k for k in range(len(std)) if np.isfinite(std[k])]
+        return ", ".join(f"{self.machine.parameters.names[k]} {self._part(std, k)}" for k in known)
 
     def _extremes(self) -> str:
         """Return the line on the extremes of the motion."""
@@ -261,7 +261,7 @@ class _Information:
         return min(sides, key=lambda matrix: _gained(matrix, machine.parameters.guess[kept]))
 
     def std(self, machine: Machine, held: Collection[int]) -> Float[np.ndarray, " p"]:
-        """Return the standard deviations if some unknowns are known; NaN for these, and where not told."""
+        """Return the standard deviations if some unknowns are known; NaN for these and the unidentifiable."""
         unknown, own = machine.parameters, self.least(machine, held)
         kept = [k for k in range(len(unknown.free)) if k not in held]
         guess, names = unknown.guess[kept], [unknown.names[k] for k in kept]
@@ -274,7 +274,7 @@ class _Information:
 
 @dataclass(frozen=True)
 class _Present:
-    """What is there before an experiment: a machine and logs, or guesses alone.
+    """Hold what is there before an experiment: a machine and logs, or guesses alone.
 
     Args:
         machine: The machine at its values.

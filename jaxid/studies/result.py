@@ -114,8 +114,8 @@ class Study:
         """
         out = []
         for estimator, setting, own in cells(self.table):
-            names, told = own.parameter.values, own["identifiable"].values.astype(bool)
-            lacking = [tuple(map(str, names[~t])) for t in told[_succeeded(own)] if not t.all()]
+            names, shown = own.parameter.values, own["identifiable"].values.astype(bool)
+            lacking = [tuple(map(str, names[~s])) for s in shown[_succeeded(own)] if not s.all()]
             out += [
                 {"estimator": estimator, **setting, "unidentifiable": list(which), "runs": runs}
                 for which, runs in Counter(lacking).most_common()

@@ -98,7 +98,7 @@ def with_value(plant, name, value):
 
 
 def test_configurations_that_do_not_tell_are_named():
-    """Where the elbow stays as straight as rounding has it, all that follows turns about one axis."""
+    """With an elbow straight but for rounding, all that follows turns about one axis."""
     few = ANGLES.copy()
     few[:, 3] = np.pi
     inertia = true_inertias("pa10", BODIES, few)[:, 2]

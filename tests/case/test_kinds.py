@@ -284,7 +284,7 @@ print(heavy, status, file=sys.stderr)
 
 
 def alone(*words: str | Path) -> tuple[str, list[str]]:
-    """What a new process prints, and the lines of its errors; the last: what it imported, and its status."""
+    """Return what a new process prints and the lines of its errors; the last has its imports and status."""
     ran = subprocess.run(
         [sys.executable, "-c", LOADED, *map(str, words)], cwd=ROOT, capture_output=True, text=True, check=True
     )

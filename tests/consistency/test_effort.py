@@ -18,7 +18,7 @@ def red(rng: np.random.Generator, correlation: float = 0.98) -> np.ndarray:
 
 
 def reported(force: np.ndarray) -> np.ndarray:
-    """What a servo makes of a force: a lag in small steps, then a delay of whole samples."""
+    """Return the force as a servo reports it: a lag in small steps, then a delay of whole samples."""
     finer, smooth, out = 50, force[0], np.empty(SAMPLES)
     for k in range(SAMPLES):
         before = force[max(k - 1, 0)]

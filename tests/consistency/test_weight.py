@@ -59,7 +59,7 @@ def test_a_weight_that_the_inertia_can_have_is_not_questioned(tmp_path, log):
 
 
 def test_an_inertia_below_that_of_the_declared_weight_is_said_first(tmp_path, log):
-    """The same weight as 0.4 kg at 0.625 m has at least 0.156 kg m^2."""
+    """A weight such as that of 0.4 kg at 0.625 m has at least 0.156 kg m^2."""
     checked, found = fitted(tmp_path, log, 0.4)
     (line,) = [line for line in checked.warnings if "below" in line]
     assert "least squares gives inertia_zz[1] = 0.133" in line

@@ -24,7 +24,7 @@ ENCODER = "velocity_average = 4\nreach = 8"
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """The same arm, sensors and course under three laws."""
+    """Run one arm with its sensors and course under three laws."""
     folder = tmp_path_factory.mktemp("laws")
     laws = {
         "pd": 'kind = "computed_torque"\ndynamics = false\nvelocity_average = 4',
@@ -35,7 +35,7 @@ def runs(tmp_path_factory):
 
 
 def test_errors_shrink_by_what_is_fed_forward(runs):
-    """Of 3 s, the last: friction alone is left of a PD's error, and of that a hundredth."""
+    """In the last of 3 s friction alone is left of a PD's error, and a hundredth of it with feedforward."""
     pd, torque, adaptive = (runs[k].rms() for k in ("pd", "computed_torque", "adaptive"))
     assert np.all(pd > 2 * torque)
     assert np.all(torque > 50 * adaptive)

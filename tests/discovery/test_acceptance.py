@@ -114,7 +114,7 @@ def test_a_short_log_is_hardly_decimated(tmp_path):
 
 
 def test_a_lag_swallows_noise_of_the_force_and_a_delay_does_not(tmp_path):
-    """Where all noise is the force's, what a lag leaves of it follows from its frequency response."""
+    """If all noise is that of the force, a lag leaves of it what its frequency response says."""
     setup = machines.emps_like(3, 1.0, 6.0)
     sensor = Sensor(position_resolution=1e-10, position_noise=1e-10, force_noise=0.02)
     session = opened(tmp_path, dataclasses.replace(setup, sensor=sensor))

@@ -237,7 +237,7 @@ def test_dry_friction_of_one_joint_is_named_alone_at_its_joint():
 
 @pytest.mark.slow
 def test_a_complete_arm_gets_nothing():
-    """What is left is more than noise by a hair, as `identify` says too: each loop shakes the other joint."""
+    """A hair more than noise is left, as `identify` says too: each loop shakes the other joint."""
     d = searched(servo_arm_case(dry()), servo_arm_log(seed=5))
     assert d.kinds == []
     assert np.all(d.gaps[0].simulation.rms < 3e-4)

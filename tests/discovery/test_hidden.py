@@ -25,7 +25,7 @@ QUICK = [next(c for c in NAMED if c.what == "constant_force" and c.scale == "ser
 
 
 def said(record):
-    """What stands in the message of a failure."""
+    """Return what stands in the message of a failure."""
     return " | ".join(f"{k}: {record.get(k)}" for k in ("verdict", "named", "alternatives", "where", "error"))
 
 

@@ -41,7 +41,7 @@ def hiding(kind: str, scale: str = "chain3", **values) -> ChainCase:
 
 
 def seen(case: ChainCase) -> Sight:
-    """What shows of the one hidden effect."""
+    """Return what the log shows of the one hidden effect."""
     return sights(case)[case.names[0]]
 
 
@@ -97,7 +97,7 @@ def test_the_validation_is_another_tour(case):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("scale", ["chain3", "chain2"])
 def test_the_balance_closes_with_the_effect(kind, scale):
-    """What the oracle ascribes to the baseline and to the effect is all that the drives move."""
+    """Baseline and effect, as the oracle has them, are all that the drives move."""
     case = hiding(kind, scale)
     setup = case.setup()
     log = setup.run()

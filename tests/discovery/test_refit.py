@@ -12,7 +12,7 @@ from jaxid.estimators.choice import Choice
 
 @dataclass(frozen=True)
 class Start:
-    """What a refit reads of the fit in forces."""
+    """Hold what a refit reads of the fit in forces."""
 
     identifiable: np.ndarray
     notes: tuple[str, ...] = ("first",)

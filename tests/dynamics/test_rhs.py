@@ -281,7 +281,7 @@ def test_iterated_integrals_are_exact_for_cubics():
 
 
 def test_weak_motion_is_the_double_integral_of_the_derivatives():
-    """Of q = sin w t: integrating t^2 q'' and t^2 q' themselves must give the same."""
+    """Integrals of t^2 q'' and t^2 q' themselves must give the same, for q = sin w t."""
     period, w = 1e-3, 9.0
     t = period * np.arange(1000)[:, None]
     acceleration, velocity = weak_motion(jnp.asarray(np.sin(w * t)), period)

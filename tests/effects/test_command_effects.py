@@ -65,7 +65,7 @@ def test_no_controller_and_no_error_are_refused():
 
 
 def test_the_lag_is_that_of_a_continuous_filter():
-    """Of a smooth reference, to a part of a tick over the time constant."""
+    """They agree for a smooth reference, to a part of a tick over the time constant."""
     constant, t = 0.03, PERIOD * np.arange(2000)
     reference = np.sin(7 * t) + 0.3 * np.sin(23 * t)
     law = CONTROLLERS["pd"](kp=jnp.asarray([1.0]), kd=jnp.asarray([0.0]), period=PERIOD)

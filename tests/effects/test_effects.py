@@ -29,7 +29,7 @@ def plant_of(effects: tuple, sharpness: float = 1e-3, **options) -> Axis:
 
 
 def places_of(row: Row) -> tuple:
-    """Of the row's effect, which stands last."""
+    """Return the places of the parameters of the row's effect, which stands last."""
     return tuple((("effects", len(row.effects) - 1, name), None) for name in row.values)
 
 

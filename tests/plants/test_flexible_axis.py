@@ -264,7 +264,14 @@ def test_names_the_flexibility_that_a_rigid_model_lacks(tmp_path):
     assert found.kinds == ["joint_flexibility"]
     swing = derived_json(found.session, found.after)["derived"]["natural_frequency"]["value"]
     assert swing == pytest.approx(FREQUENCY, rel=0.03)
-    assert found.gaps_after[-1].force.rms[0] < 0.4 * found.gaps_before[-1].force.rms[0]
+
+    baseline, named = found.rounds[:2]
+    assert named.step.added.candidate.kind == "joint_flexibility"
+    assert named.validation[0] < 0.4 * baseline.validation[0]
+    # The effect has no friction of the load: the refit in positions loses some of the gain in forces.
+    before, after = (gaps[-1].simulation.rms[0] for gaps in (found.gaps_before, found.gaps_after))
+    assert after < 0.4 * before
+    assert not any("complete for this log" in line for line in found.findings)
 
 
 @pytest.mark.slow

@@ -148,7 +148,7 @@ def test_each_joint_has_its_own_bounds_by_sign():
 
 
 def visited(table, duration=200.0):
-    """Where a reference rests: its targets."""
+    """Return the targets of a reference, at which it rests."""
     q = make_reference({**table, "dwell": 0.05}, 500.0, duration)
     still = np.all(np.diff(q, axis=0) == 0, axis=1)
     return q[1:][still & ~np.roll(still, 1)][1:]

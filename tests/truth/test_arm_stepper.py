@@ -79,7 +79,7 @@ def test_joints_that_stand_pull_at_the_others_as_they_should(truth):
 
 
 def test_accelerations_have_first_and_second_derivatives():
-    """Of a root, not of the elimination that finds it."""
+    """They are those of a root, not of the elimination that finds it."""
     arm, u = plant(), jnp.linspace(-5.0, 5.0, 7)
     motion = jnp.linspace(-1.0, 1.0, 7), jnp.linspace(1.0, -2.0, 7)
     x = jnp.concatenate([*motion, jnp.asarray(ARM.bodies[:, 9])])

@@ -27,7 +27,7 @@ def free_run(machine: ChainMachine, duration: float = 1.0, force=0.0, **options)
 
 
 def energy(machine: ChainMachine, log) -> np.ndarray:
-    """Of masses and linear springs (time,) [J]."""
+    """Return the energy of masses and linear springs, (time,) [J]."""
     e = elongations(log["true_position"])
     kinetic = log["true_velocity"] ** 2 @ np.array(machine.mass)
     return 0.5 * (kinetic + e**2 @ np.array(machine.stiffness))
