@@ -46,9 +46,10 @@ def set_valued_step(
 ) -> tuple[State, Array]:
     """Advance one step under set-valued friction: flow without it, then the reaction that stops or drags.
 
-    A port slides under the level of dry friction halfway. If it comes to rest within the step it stays
-    if the break-away level holds it, and otherwise moves back for the rest of the step: the reaction is
-    then the mean of both parts, and the position that of two parabolas, of second order in the step.
+    A port slides under the level of dry friction halfway, in motion and time. If it comes to rest within the
+    step it stays if the break-away level holds it, and otherwise moves back for the rest of the step: the
+    reaction is then the mean of both parts, and the position that of two parabolas, of second order in the
+    step.
     Ports that are coupled through the mass matrix share their reactions by Gauss-Seidel sweeps, each
     computed with the current reactions of the others.
 
@@ -68,7 +69,7 @@ def set_valued_step(
     end = u(jnp.asarray(1.0))
 
     def at(q: Array, qd: Array, qdd: Array = standing) -> Balance:
-        return balance_of(plant, q, qd, qdd, end, t, x.own, none)
+        return balance_of(plant, q, qd, qdd, end, t + 0.5 * h, x.own, none)
 
     def action(free: State) -> _Answer:
         """Return the action of friction over the step, given the step without it."""

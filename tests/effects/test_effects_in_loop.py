@@ -115,8 +115,8 @@ def distance(name: str, substeps: int) -> float:
 
 
 # Of the stroke. Dry friction turns exactly within a step where its level is constant; one that moves with
-# speed is taken halfway (second order), one that drifts at the step's start (first), and so is one that
-# jumps with the direction where the joint turns. Under a delay off the grid a line stands in a tick for two
+# speed or drifts is taken halfway (second order), one that jumps with the direction as at the step's start
+# where the joint turns (first). Under a delay off the grid a line stands in a tick for two
 # values (third order in it). |v| is rounded over 1 mm/s, the corners of the limit by voltage, which speed
 # crosses within a tick, over a thousandth of it. All else is smooth: the stepper's second order at 5 us.
 CLOSE = {
@@ -126,7 +126,6 @@ CLOSE = {
     "quadratic_drag": 2e-9,
     "stribeck_friction": 2e-8,
     "velocity_hysteresis": 2e-8,
-    "friction_drift": 1e-6,
     "voltage_limit": 2e-8,
     "load_friction": 1e-5,
 }
@@ -154,10 +153,11 @@ def test_one_step_a_tick_turns_where_friction_does(name):
     [
         ("stribeck_friction", 0.1),
         ("velocity_hysteresis", 0.1),
-        ("friction_drift", 0.4),
+        ("friction_drift", 0.2),
         ("load_friction", 0.4),
     ],
 )
 def test_distance_to_the_truth_falls_with_the_step(name, part):
-    # Second order, and first, as said above: a sixteenth and a fourth.
+    # Second order, and first, as said above: a sixteenth and a fourth. The error of a drift is so small that
+    # the stepper's counts.
     assert distance(name, 16) < part * distance(name, 4)
