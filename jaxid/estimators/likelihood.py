@@ -38,10 +38,9 @@ _QUIET = 1e-3
 # First samples of a log with dry friction: a filter that begins with the wrong direction of motion takes the
 # friction for certain, and keeps its error.
 _BEGINS = 4
-# Steps of the last fit of such a log for each one before, and least number with a lag in the drive. The last
-# number is the least one of the last fit where friction changes with speed: four moved the speed of a
-# Stribeck curve in a chain by 3.6e-4, 6 sigma.
-_FINER, _FINEST = 4, 16
+# Steps of the last fit of such a log for each one before, and least number with a lag in the drive or with
+# friction that changes with speed.
+_FINER = 4
 
 
 @dataclass(frozen=True)
@@ -83,10 +82,7 @@ class Likelihood:
     def at_rest_too(self, problem: Innovations) -> Innovations:
         """Return the likelihood with the samples at rest."""
         # So precise a fit shows the error of a step in which a joint comes to rest.
-        steps = _FINER * self.numerics.substeps
-        if _friction_follows_speed(self.machine, self.log):
-            steps = max(steps, _FINEST)
-        finer = replace(self.numerics, substeps=steps)
+        finer = replace(self.numerics, substeps=_FINER * self.numerics.substeps)
         offset = None if self.law is None else self.law.offset
         kalman = make_filter(self.machine, self.log, finer, self.unsure, offset)
         return problem._replace(kalman=kalman, counts=_counted(kalman, self.log, self.unsure))
@@ -184,8 +180,11 @@ def needed_numerics(machine: Machine, log: Log, start: np.ndarray | None) -> Num
     near = machine if start is None else machine.with_estimate(np.clip(start, *machine.parameters.bounds))
     steps = needed_steps(near, log)
     own = machine.plant.initial_states(jnp.zeros(machine.gain.size))
-    if jax.tree.leaves(own) and slides(machine, log):
-        # Behind a lag the force changes within a step, and with it the instant at which a joint turns.
+    lags = bool(jax.tree.leaves(own)) and slides(machine, log)
+    if lags or _friction_follows_speed(machine, log):
+        # Behind a lag the force changes within a step, and with it the instant at which a joint turns. The
+        # friction of one long step is that of its middle: its error looks like noise of the force, under
+        # which the likelihood neither finds the friction's speed nor counts the samples at rest.
         steps = max(steps, _FINER)
     return exact_numerics(machine, log, steps)
 

@@ -119,6 +119,20 @@ def test_a_force_beside_a_law_with_an_integral_has_intervals_that_hold():
 
 
 @pytest.mark.slow
+def test_a_stribeck_curve_in_samples_of_5_ms_has_intervals_that_hold():
+    """With one step a sample its level was 9 sigma off, and sigma 26 times as large."""
+    case = next(c for c in cases("last") if c.seed == 14343)
+    setup = case.setup()
+    run = setup.run()
+    text = case_text(setup, [*case.values.items()], off=1.3, motion=case.size.motion, sensor=case.sensor)
+    log = {"t": run["t"], "q": run["position"], "u": run["force"], "ref": run["reference"]}
+    fit = jaxid.identify(tomllib.loads(text), log, method="prediction_error").estimate
+    true = np.array([case.truth[name] for name in fit.names])
+    assert np.all(np.abs(fit.theta - true) < 3.5 * fit.std)
+    assert fit.std[fit.names.index("stribeck_friction.level")] < 1e-4 * case.truth["stribeck_friction.level"]
+
+
+@pytest.mark.slow
 def test_an_encoder_of_500_counts_a_turn_gives_intervals_that_hold():
     """Without the samples at rest sigma was 2.7 times as large, and held less often."""
     count, t, z, parts = 2 * np.pi / 500, np.arange(4000) / 500.0, [], []
