@@ -45,6 +45,7 @@ class Arm:
         command: Commands a row, (rows, 2) [rad].
         hidden: Kind that the case does not declare; None: the case is complete.
         joint: Its joint, from 0.
+        far: Whether every guess of the case is two to five times off, in place of up to three times.
     """
 
     seed: int
@@ -56,6 +57,7 @@ class Arm:
     command: np.ndarray = field(repr=False)
     hidden: str | None = None
     joint: int = 0
+    far: bool = False
 
     known = False
 
@@ -89,11 +91,12 @@ class Arm:
         return out
 
     def case(self) -> dict:
-        """Return the case, its guesses up to a factor of three off."""
+        """Return the case, its guesses far from the truth."""
         rng = np.random.default_rng([392, self.seed])
 
         def guess(value: float) -> dict[str, float]:
-            return {"guess": float(value * 3 ** rng.uniform(-1, 1))}
+            factor = rng.uniform(2, 5) ** rng.choice((-1, 1)) if self.far else 3 ** rng.uniform(-1, 1)
+            return {"guess": float(value * factor)}
 
         controller: dict = {"kind": "pd", "period": 1 / self.rate}
         controller |= {name: [guess(getattr(s, name)) for s in self.servos] for name in ("kp", "kd")}
@@ -136,6 +139,16 @@ class Arm:
                 "reference_hold": "zero_order",
             },
         }
+
+    def truth(self) -> dict[str, float]:
+        """Return the true values of the unknowns of a complete case, by name."""
+        out = {}
+        for k, servo in enumerate(self.servos, start=1):
+            out |= {f"rotor_inertia[{k}]": servo.rotor}
+            out |= {f"controller.{name}[{k}]": getattr(servo, name) for name in ("kp", "kd")}
+            out |= {f"{kind}[{k}].{name}": servo.effects[kind][name] for kind, name in DECLARED.items()}
+            out |= {f"controller.delay[{k}]": servo.effects["command_delay"]["delay"]}
+        return out
 
     def label(self, kind: str, port: int) -> str:
         """Return the name of an effect in the records, with its joint from 1."""

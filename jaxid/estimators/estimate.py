@@ -84,3 +84,16 @@ class Estimate:
             text = f"{v:.6g} ± {s:.2g} {f.unit}" if ok else "not identifiable from this log"
             lines.append(f"{f.name:32s} {text}")
         return "\n".join(lines)
+
+
+def misfit(estimate: Estimate) -> float:
+    """Return a number by which fits of the same logs compare, the least one that of the best fit.
+
+    It is the squared residual of one log; that of each log of several is divided by its noise.
+    """
+    logs = list(estimate.details.get("fits", {}).values())
+    if not logs:
+        return float(np.nansum(estimate.residual**2))
+    samples = [log["samples"] for log in logs]
+    # Each log counts by its own noise, so that the likelihood is that of the sum of these logarithms.
+    return float(np.dot(samples, [2 * np.log(max(log["noise"], 1e-300)) for log in logs]))

@@ -17,10 +17,10 @@ from jaxtyping import Float
 from jaxid.consistency.absent import without_scale
 from jaxid.controllers.linear import PD, PID, CascadePD
 from jaxid.estimators.apart.joint import stands_apart
-from jaxid.estimators.apart.steps import apart_steps
+from jaxid.estimators.apart.whole import arm_steps, start_by_joints, whole_steps
 from jaxid.estimators.coarse_starts import coarse_starts
 from jaxid.estimators.effort import SCALE, Scale, scale_by_effort
-from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.estimate import Estimate, misfit
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
@@ -49,7 +49,7 @@ def unforced_steps(
 ) -> Steps[Estimate]:
     """Fit the positions of loops whose force was not logged, from several starts, to one log or to several.
 
-    The joints of an arm are fitted one by one if each has a servo, see `jaxid.estimators.apart`.
+    An arm of servos starts from fits of each joint alone, see `jaxid.estimators.apart`.
 
     Args:
         session: Case and logs of the fit.
@@ -59,21 +59,23 @@ def unforced_steps(
     """
     machine = session.machine
     if stands_apart(machine, parts_of(session)):
-        return (yield from apart_steps(machine, parts_of(session), numerics=numerics, **options))
+        return (yield from arm_steps(machine, parts_of(session), numerics=numerics, **options))
     group = common_scale_group(machine, parts_of(session))
     base = base_of(machine, group) if group else None
     fitted = machine if base is None else without(machine, base)
     parts = parts_of(session.with_machine(fitted))
     chosen = [numerics or choose_numerics(part.machine, part.log) for part in parts]
 
-    starts = coarse_starts(fitted, parts, chosen)
+    by_joints = yield from start_by_joints(fitted, parts)
+    starts = coarse_starts(fitted, parts, chosen) if by_joints is None else [by_joints]
     if len(parts) > 1:
         starts = starts[:_STARTS_TOGETHER]
-    fits = []
+    fits, fit = [], output_error_steps if by_joints is None else whole_steps
     for start in starts:
-        fits.append((yield from output_error_steps(fitted, parts, start=start, numerics=numerics, **options)))
-    result = min(fits, key=lambda e: (not e.converged, _cost(e)))
-    if len(parts) == 1 and result.converged:
+        fits.append((yield from fit(fitted, parts, start=start, numerics=numerics, **options)))
+    result = min(fits, key=lambda e: (not e.converged, misfit(e)))
+    if len(parts) == 1 and result.converged and by_joints is None:
+        # The noise of every joint of an arm takes ten times as long, and moves the estimates by little.
         noisy = yield from fitted_with_noise(fitted, parts[0].log, result.theta, numerics=numerics, **options)
         result = noisy or result
     if base is None:
@@ -82,16 +84,6 @@ def unforced_steps(
     if scale is not None:
         return with_known_scale(result, machine, group, base, scale)
     return with_free_scale(result, machine, group, base)
-
-
-def _cost(estimate: Estimate) -> float:
-    """Return the squared residual; that of each log of several is divided by its noise."""
-    logs = list(estimate.details.get("fits", {}).values())
-    if not logs:
-        return float(np.nansum(estimate.residual**2))
-    samples = [log["samples"] for log in logs]
-    # Each log counts by its own noise, so that the likelihood is that of the sum of these logarithms.
-    return float(np.dot(samples, [2 * np.log(max(log["noise"], 1e-300)) for log in logs]))
 
 
 def common_scale_group(machine: Machine, parts: Sequence[Part]) -> tuple[int, ...]:

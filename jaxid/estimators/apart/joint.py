@@ -31,7 +31,7 @@ from jaxid.plants.loaded_axis import LoadedAxis
 from jaxid.sensors.encoder import Sensor
 
 # Unknown inertias of the rotors among the parameters of a tree.
-_ROTOR = "rotor_inertia"
+ROTOR = "rotor_inertia"
 # Most rows at which a joint's own inertia is evaluated for its mean.
 _ROWS = 200
 
@@ -93,8 +93,32 @@ class JointAlone:
 def stands_apart(machine: Machine, parts: Sequence[Part]) -> bool:
     """Check that every joint of a machine can be fitted alone.
 
-    It is an arm of several joints whose positions were all measured, each with a servo, and no unknown
-    belongs to several joints.
+    It is an arm of servos, see `is_arm_of_servos`, and no unknown belongs to several joints.
+
+    Args:
+        machine: Machine of all logs.
+        parts: The logs.
+    """
+    alone = len(unknowns_of_joints(machine)) == len(machine.parameters.free)
+    return alone and is_arm_of_servos(machine, parts)
+
+
+def unknowns_of_joints(machine: Machine) -> list[int]:
+    """Return the numbers of an arm's unknowns that belong to one joint, and are the same in all logs."""
+    if not isinstance(machine.plant, LinkTree):
+        return []
+    free = enumerate(machine.parameters.free)
+    return [k for k, f in free if f.log is None and _joint_of(f, machine) is not None]
+
+
+def unknowns_of_links(machine: Machine) -> list[int]:
+    """Return the numbers of an arm's unknowns that its links have, and that are the same in all logs."""
+    free = enumerate(machine.parameters.free)
+    return [k for k, f in free if f.effect is None and f.log is None and f.path[0] not in (ROTOR, CONTROLLER)]
+
+
+def is_arm_of_servos(machine: Machine, parts: Sequence[Part]) -> bool:
+    """Check for an arm of several joints whose positions were all measured, each with a servo.
 
     Args:
         machine: Machine of all logs.
@@ -104,8 +128,6 @@ def stands_apart(machine: Machine, parts: Sequence[Part]) -> bool:
     if not isinstance(plant, LinkTree) or plant.joints < 2 or type(law) not in (PD, CascadePD):
         return False
     if len(plant.driven(plant.joints)) < plant.joints or plant.shafts or machine.parameters.bodies:
-        return False
-    if any(_joint_of(f, machine) is None or f.log is not None for f in machine.parameters.free):
         return False
     several = [part.log.reference is not None and part.log.reference.shape[1] > 1 for part in parts]
     usual = [part.machine.disturbance is None and part.machine.unforced(part.log) for part in parts]
@@ -143,7 +165,7 @@ def joints_alone(machine: Machine, parts: Sequence[Part], others: Sequence[Part]
             alone.append(Part(part.name, _log(part, joint), one, index, _prepared(part.data, joint)))
         whole = _machine(machine, joint, means[joint], _column(alone[0].machine))
         index = np.array([names.index(name) for name in own])
-        ratio = float(_ratios(machine.plant)[joint])
+        ratio = float(gear_squares(machine.plant)[joint])
         fitted, beside = tuple(alone[: len(parts)]), tuple(alone[len(parts) :])
         out.append(JointAlone(joint, whole, fitted, index, float(means[joint]), ratio, beside))
     return out
@@ -162,7 +184,7 @@ def _joint_of(f: Free, machine: Machine) -> int | None:
         return port if port < plant.joints else None
     if f.path[0] == CONTROLLER:
         return plant.driven(plant.joints)[f.index] if isinstance(f.index, int) else None
-    return f.index if f.path == (_ROTOR,) and isinstance(f.index, int) else None
+    return f.index if f.path == (ROTOR,) and isinstance(f.index, int) else None
 
 
 def links_of(machine: Machine) -> LinkTree:
@@ -171,7 +193,7 @@ def links_of(machine: Machine) -> LinkTree:
     return replace(machine.plant, effects=(), rotor_inertia=None)
 
 
-def _ratios(plant: Any) -> np.ndarray:
+def gear_squares(plant: Any) -> np.ndarray:
     """Return the square of each joint's gear ratio."""
     return np.ones(plant.joints) if plant.gear_ratio is None else np.asarray(plant.gear_ratio) ** 2
 
@@ -194,7 +216,7 @@ def _machine(machine: Machine, joint: int, links: float, load: Float[np.ndarray,
     assert isinstance(plant, LinkTree), "checked by stands_apart"
     assert law is not None, "checked by stands_apart"
     drive = plant.driven(plant.joints).index(joint)
-    ratio, rotors = _ratios(plant)[joint], plant.rotor_inertia
+    ratio, rotors = gear_squares(plant)[joint], plant.rotor_inertia
     rotor = 0.0 if rotors is None else ratio * float(np.asarray(rotors)[joint])
 
     effects: tuple[Effect, ...] = tuple(replace(e, port=0) for e in plant.effects if e.port == joint)
@@ -227,7 +249,7 @@ def own_place(
     if path[0] == "effects":
         numbers = _effects_at(machine, joint)
         return (("effects", numbers.index(path[1]), *path[2:]), index) if path[1] in numbers else None
-    return (("inertia",), None) if path == (_ROTOR,) and index == joint else None
+    return (("inertia",), None) if path == (ROTOR,) and index == joint else None
 
 
 def _effects_at(machine: Machine, joint: int) -> list[int | str]:

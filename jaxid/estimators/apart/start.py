@@ -26,7 +26,7 @@ from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER
 
 # Delays that are tried, if the delay is unknown [s].
-_DELAYS = np.arange(0.0, 0.205, 0.005)
+DELAYS = np.arange(0.0, 0.205, 0.005)
 # Steps of these on either side of a fit from which it is tried again.
 _BESIDE = 2
 # Gains that are tried, as parts of the guess.
@@ -36,7 +36,7 @@ _FARTHEST = 1e3
 # Part of the guess at which a friction starts that the balance does not show.
 _LITTLE = 1e-2
 # Part of the spread of the velocity from which a joint counts as moving, and the fewest such rows.
-_MOVING, _FEWEST = 0.2, 10
+MOVING, _FEWEST = 0.2, 10
 
 
 def starts_by_balance(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
@@ -54,7 +54,7 @@ def starts_by_balance(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
     balance = _Balance.of(alone)
     if balance is None:
         return []
-    delays = range(len(_DELAYS)) if "delay" in unknown else [_nearest(_delay(machine))]
+    delays = range(len(DELAYS)) if "delay" in unknown else [_nearest(_delay(machine))]
     starts = [_start(machine, unknown, found) for found in balance.solutions(delays, _stiffness(machine))]
     return [start for start in starts if is_stable(machine.with_estimate(start))]
 
@@ -74,7 +74,7 @@ def starts_beside(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
     if balance is None:
         return []
     own = _nearest(float(machine.parameters.guess[unknown["delay"]]))
-    beside = [k for k in range(own - _BESIDE, own + _BESIDE + 1) if 0 <= k < len(_DELAYS)]
+    beside = [k for k in range(own - _BESIDE, own + _BESIDE + 1) if 0 <= k < len(DELAYS)]
     found = [next(balance.solutions([k], _stiffness(machine))) for k in beside]
     starts = [_start(machine, unknown, one) for one in found]
     return [start for start in starts if is_stable(machine.with_estimate(start))]
@@ -131,9 +131,9 @@ class _Balance:
             q, v, a = (x[:, 0] for x in (part.data.q, part.data.qd, part.data.qdd))
             force = float(np.asarray(machine.plant.own_inertia())) * a - machine.load[:, 0]
             # Of rest the balance says no more than an interval for dry friction.
-            counts = np.abs(v) > _MOVING * np.std(v)
-            counts &= log.time > log.time[0] + _DELAYS[-1]
-            late = [np.interp(log.time[counts] - d, log.time, log.reference[:, 0]) for d in _DELAYS]
+            counts = np.abs(v) > MOVING * np.std(v)
+            counts &= log.time > log.time[0] + DELAYS[-1]
+            late = [np.interp(log.time[counts] - d, log.time, log.reference[:, 0]) for d in DELAYS]
             rows.append(np.stack([force, v, np.sign(v)], axis=1)[counts])
             errors.append(np.stack(late) - q[counts])
         matrix, error = np.concatenate(rows), np.concatenate(errors, axis=1)
@@ -166,7 +166,7 @@ class _Balance:
         if compliance is not None:
             values = np.append(compliance, values)
         inverse, lag, dry = (float(x) for x in values)
-        found = _Found(inverse, lag, dry, float(_DELAYS[delay]))
+        found = _Found(inverse, lag, dry, float(DELAYS[delay]))
         return found, float(np.hypot(misfit, self.rest[delay]))
 
 
@@ -215,7 +215,7 @@ def _delay(machine: Machine) -> float:
 
 
 def _nearest(delay: float) -> int:
-    return int(np.argmin(np.abs(_DELAYS - delay)))
+    return int(np.argmin(np.abs(DELAYS - delay)))
 
 
 def _stiffness(machine: Machine) -> float:

@@ -23,7 +23,7 @@ from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import needed_steps
 
 # Part of the cost by which several logs have converged: what servos leave is far more than noise.
-_TOLERANCE = 1e-7
+TOLERANCE = 1e-7
 # Part of the squared residual of the start by balance below which another start is taken.
 _CLEARLY = 0.7
 # Starts in a compiled call.
@@ -74,7 +74,7 @@ def joint_fits(
             start=_start(alone, numerics),
             numerics=numerics,
             profile=[name for name in profile if name in alone.machine.parameters.names],
-            tolerance=_TOLERANCE,
+            tolerance=TOLERANCE,
             **options,
         )
         for alone in joints
