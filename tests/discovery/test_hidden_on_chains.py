@@ -230,3 +230,12 @@ def test_a_stribeck_curve_in_a_chain_has_intervals_that_hold():
     assert fit.converged
     off = fit.theta - [case.truth[name] for name in fit.names]
     assert np.all(np.abs(off) < 3.5 * fit.std)
+
+
+@pytest.mark.slow
+def test_a_rival_that_ran_away_gets_no_experiment(tmp_path):
+    """Its presliding stiffness of 1e130 N/m ended the process while an experiment was designed."""
+    case = next(c for c in cases("last") if c.seed == 7003)
+    found = discover(write_case(tmp_path, text_of(case)), logged(case), refit=False)
+    assert [e.label for e in found.effects] == ["coulomb_friction[2]"]
+    assert not any(p.separates for p in found.proposals)

@@ -145,9 +145,14 @@ def propose(session: Session, search: Search, named: cand.Candidate, rival: Scor
     playback = _playback(session, search, pair, experiment)
     shapes, starts = _family(session, limits, experiment)
 
+    # The motion of a rival with a value that ran away is not finite, for every signal. The code that XLA makes
+    # of its derivatives ended the process there.
+    tried = playback.runs(pair, shapes.signal(starts[-1]))
+    finite = all(np.all(np.isfinite(run.position)) for run in tried)
+
     # Signals are optimised with smooth friction, and judged by simulation with exact friction.
     best, outcome, peaks = None, None, None
-    for p in _optimised(starts, experiment, ModelPair.of(rounded), shapes, limits):
+    for p in _optimised(starts, experiment, ModelPair.of(rounded), shapes, limits) if finite else []:
         fitting = kept_within(limits, shapes, p, lambda signal: playback.peaks(pair, signal))
         if fitting is None:
             continue
