@@ -145,8 +145,8 @@ def propose(session: Session, search: Search, named: cand.Candidate, rival: Scor
     playback = _playback(session, search, pair, experiment)
     shapes, starts = _family(session, limits, experiment)
 
-    # The motion of a rival with a value that ran away is not finite, for every signal. The code that XLA makes
-    # of its derivatives ended the process there.
+    # The motion of a rival with a value that ran away is not finite, whatever the signal, and XLA's code for
+    # its derivatives ended the process.
     tried = playback.runs(pair, shapes.signal(starts[-1]))
     finite = all(np.all(np.isfinite(run.position)) for run in tried)
 
