@@ -60,7 +60,7 @@ def starts_by_balance(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
 
 
 def starts_beside(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
-    """Return values of a joint's unknowns by the balance at delays beside its own; empty if it is known.
+    """Return values of a joint's unknowns by the balance at delays near that of its fit; empty if it is known.
 
     A command that is held from row to row leaves the cost several minima along the delay, less than a row
     apart.

@@ -140,7 +140,7 @@ def _by_simulated_loads(
 ) -> Steps[Float[np.ndarray, " p"]]:
     """Return values with those of the servos by fits of each joint under the loads of the simulated arm.
 
-    A joint begins at its balance, and at the balances with delays beside its own; its best fit counts.
+    A joint begins at its balance, and at the balances with the neighbouring delays; its best fit counts.
     """
     own = unknowns_of_joints(machine)
     at = [replace(part, machine=part.at(theta)) for part in parts]
