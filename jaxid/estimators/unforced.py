@@ -70,7 +70,8 @@ def unforced_steps(
     starts = coarse_starts(fitted, parts, chosen) if by_joints is None else [by_joints]
     if len(parts) > 1:
         starts = starts[:_STARTS_TOGETHER]
-    fits, fit = [], output_error_steps if by_joints is None else whole_steps
+    fit = output_error_steps if by_joints is None else whole_steps
+    fits = []
     for start in starts:
         fits.append((yield from fit(fitted, parts, start=start, numerics=numerics, **options)))
     result = min(fits, key=lambda e: (not e.converged, misfit(e)))

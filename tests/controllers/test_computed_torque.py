@@ -35,7 +35,7 @@ def runs(tmp_path_factory):
 
 
 def test_errors_shrink_by_what_is_fed_forward(runs):
-    """In the last of 3 s friction alone is left of a PD's error, and a hundredth of it with feedforward."""
+    """Computed torque leaves what friction makes of a PD's error, the adaptive law a fiftieth of that."""
     pd, torque, adaptive = (runs[k].rms() for k in ("pd", "computed_torque", "adaptive"))
     assert np.all(pd > 2 * torque)
     assert np.all(torque > 50 * adaptive)

@@ -19,8 +19,8 @@ import scipy.stats
 from jaxtyping import Float
 
 from jaxid.controllers.linear import CascadePD
+from jaxid.estimators.apart.balance import Reduced, errors_by_delay, fit_nonnegative, rows_in_motion
 from jaxid.estimators.apart.joint import ROTOR, gear_squares, links_of, of_links
-from jaxid.estimators.apart.start import DELAYS, MOVING
 from jaxid.estimators.several.parts import Part
 from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER, Free
@@ -110,13 +110,17 @@ class _JointBalance:
     def of(cls, machine: Machine, parts: Sequence[Part], unknown: Sequence[int], joint: int) -> _JointBalance:
         """Return the balance of a joint along all logs."""
         rows, errors = zip(*(_rows(machine, part, unknown, joint) for part in parts), strict=True)
-        matrix, error = np.concatenate(rows), np.concatenate(errors, axis=1)
-        basis, triangle = np.linalg.qr(matrix)
-        inside = error @ basis
-        rest = np.maximum(np.sum(error**2, axis=1) - np.sum(inside**2, axis=1), 0.0)
-        k = 1 + len(unknown)
-        columns = triangle[:, 0], triangle[:, 1:k], triangle[:, k:]
-        return cls(*columns, inside, rest, len(matrix), _compliance(machine, joint))
+        whole = np.concatenate(rows)
+        reduced, k = Reduced.of(whole, np.concatenate(errors, axis=1)), 1 + len(unknown)
+        return cls(
+            known=reduced.columns[:, 0],
+            slopes=reduced.columns[:, 1:k],
+            own=reduced.columns[:, k:],
+            errors=reduced.errors,
+            rest=reduced.rest,
+            rows=len(whole),
+            compliance=_compliance(machine, joint),
+        )
 
     def cost(self, change: Float[np.ndarray, " k"]) -> float:
         """Return the negative log-likelihood at changes of the links' unknowns, at its best delay."""
@@ -125,8 +129,7 @@ class _JointBalance:
             columns = np.column_stack([force, columns])
         else:
             errors = errors - self.compliance * force
-        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        left = [scipy.optimize.nnls(columns / size, error)[1] ** 2 for error in errors]
+        left = [fit_nonnegative(columns, error)[1] ** 2 for error in errors]
         return 0.5 * self.rows * float(np.log(max(np.min(np.array(left) + self.rest), 1e-300)))
 
 
@@ -135,11 +138,9 @@ def _rows(
 ) -> tuple[Float[np.ndarray, "rows m"], Float[np.ndarray, "delays rows"]]:
     """Return the columns of a joint's balance along a log, and the error of its position by delay."""
     log, theta, data = part.log, machine.parameters.guess, part.data
-    assert log.reference is not None, "checked by is_arm_of_servos"
     plant, drive = machine.plant, machine.plant.driven(machine.plant.joints).index(joint)
     q, v, a = (x[:, joint] for x in (data.q, data.qd, data.qdd))
-    # Of rest the balance says no more than an interval for dry friction.
-    counts = (np.abs(v) > MOVING * np.std(v)) & (log.time > log.time[0] + DELAYS[-1])
+    counts = rows_in_motion(log, v)
 
     def force(theta: np.ndarray) -> np.ndarray:
         return np.asarray(of_links(links_of(part.at(theta)), data.q, data.qd, data.qdd)[0])[:, joint]
@@ -154,8 +155,7 @@ def _rows(
         own = [a, *own]
     elif isinstance(plant, LinkTree) and plant.rotor_inertia is not None:
         known = known + gear_squares(plant)[joint] * float(np.asarray(plant.rotor_inertia)[joint]) * a
-    late = [np.interp(log.time[counts] - d, log.time, log.reference[:, drive]) for d in DELAYS]
-    return np.stack([known, *columns, *own], axis=1)[counts], np.stack(late) - q[counts]
+    return np.stack([known, *columns, *own], axis=1)[counts], errors_by_delay(log, drive, q, counts)
 
 
 def _compliance(machine: Machine, joint: int) -> float | None:

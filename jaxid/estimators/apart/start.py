@@ -17,17 +17,21 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 from jaxtyping import Float
 
 from jaxid.controllers.linear import CascadePD
+from jaxid.estimators.apart.balance import (
+    DELAYS,
+    Reduced,
+    errors_by_delay,
+    fit_nonnegative,
+    rows_in_motion,
+)
 from jaxid.estimators.apart.joint import JointAlone
 from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER
 
-# Delays that are tried, if the delay is unknown [s].
-DELAYS = np.arange(0.0, 0.205, 0.005)
-# Steps of these on either side of a fit from which it is tried again.
+# Steps of the delays that are tried on either side of a fit from which it is tried again.
 _BESIDE = 2
 # Gains that are tried, as parts of the guess.
 _GAINS = (1 / 300, 1 / 100, 1 / 30, 1 / 10, 1 / 3, 1.0)
@@ -35,8 +39,8 @@ _GAINS = (1 / 300, 1 / 100, 1 / 30, 1 / 10, 1 / 3, 1.0)
 _FARTHEST = 1e3
 # Part of the guess at which a friction starts that the balance does not show.
 _LITTLE = 1e-2
-# Part of the spread of the velocity from which a joint counts as moving, and the fewest such rows.
-MOVING, _FEWEST = 0.2, 10
+# Fewest rows in motion.
+_FEWEST = 10
 
 
 def starts_by_balance(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
@@ -60,7 +64,7 @@ def starts_by_balance(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
 
 
 def starts_beside(alone: JointAlone) -> list[Float[np.ndarray, " own"]]:
-    """Return values of a joint's unknowns by the balance at delays near that of its fit; empty if it is known.
+    """Return values of a joint's unknowns by the balance at delays near that of its fit; none if it is known.
 
     A command that is held from row to row leaves the cost several minima along the delay, less than a row
     apart.
@@ -108,17 +112,9 @@ class _Found:
 
 @dataclass(frozen=True)
 class _Balance:
-    """The balance at all rows in motion, reduced to a triangular matrix.
+    """The balance at all rows in motion, with the columns of force, damping and dry friction."""
 
-    Args:
-        matrix: Coefficients of the three unknowns, (3, 3).
-        errors: Reduced error of the position by delay, (delays, 3).
-        rest: Norm of what no value explains, by delay, (delays,).
-    """
-
-    matrix: Float[np.ndarray, "3 3"]
-    errors: Float[np.ndarray, "delays 3"]
-    rest: Float[np.ndarray, " delays"]
+    rows: Reduced
 
     @classmethod
     def of(cls, alone: JointAlone) -> _Balance | None:
@@ -126,23 +122,16 @@ class _Balance:
         rows, errors = [], []
         for part in alone.parts:
             log, machine = part.log, part.machine
-            assert log.reference is not None, "checked by stands_apart"
             assert machine.load is not None, "a joint alone has one"
             q, v, a = (x[:, 0] for x in (part.data.q, part.data.qd, part.data.qdd))
             force = float(np.asarray(machine.plant.own_inertia())) * a - machine.load[:, 0]
-            # Of rest the balance says no more than an interval for dry friction.
-            counts = np.abs(v) > MOVING * np.std(v)
-            counts &= log.time > log.time[0] + DELAYS[-1]
-            late = [np.interp(log.time[counts] - d, log.time, log.reference[:, 0]) for d in DELAYS]
+            counts = rows_in_motion(log, v)
             rows.append(np.stack([force, v, np.sign(v)], axis=1)[counts])
-            errors.append(np.stack(late) - q[counts])
-        matrix, error = np.concatenate(rows), np.concatenate(errors, axis=1)
-        if len(matrix) < _FEWEST:
+            errors.append(errors_by_delay(log, 0, q, counts))
+        columns = np.concatenate(rows)
+        if len(columns) < _FEWEST:
             return None
-        basis, triangle = np.linalg.qr(matrix)
-        inside = error @ basis
-        rest = np.sum(error**2, axis=1) - np.sum(inside**2, axis=1)
-        return cls(triangle, inside, np.sqrt(np.maximum(rest, 0.0)))
+        return cls(Reduced.of(columns, np.concatenate(errors, axis=1)))
 
     def solutions(self, delays: range | list[int], stiffness: float) -> Iterator[_Found]:
         """Return the best values at any gain, and those at some gains about a guess."""
@@ -158,16 +147,15 @@ class _Balance:
 
     def _at(self, delay: int, compliance: float | None) -> tuple[_Found, float]:
         """Return the values at a delay, and the misfit; a gain may be given."""
-        free = self.matrix if compliance is None else self.matrix[:, 1:]
-        error = self.errors[delay] - (0.0 if compliance is None else compliance * self.matrix[:, 0])
-        size = np.maximum(np.linalg.norm(free, axis=0), 1e-300)
-        values, misfit = scipy.optimize.nnls(free / size, error)
-        values = values / size
-        if compliance is not None:
+        columns, error = self.rows.columns, self.rows.errors[delay]
+        if compliance is None:
+            values, misfit = fit_nonnegative(columns, error)
+        else:
+            values, misfit = fit_nonnegative(columns[:, 1:], error - compliance * columns[:, 0])
             values = np.append(compliance, values)
         inverse, lag, dry = (float(x) for x in values)
         found = _Found(inverse, lag, dry, float(DELAYS[delay]))
-        return found, float(np.hypot(misfit, self.rest[delay]))
+        return found, float(np.hypot(misfit, np.sqrt(self.rows.rest[delay])))
 
 
 def _start(machine: Machine, unknown: dict[str, int], found: _Found) -> Float[np.ndarray, " own"]:
