@@ -258,20 +258,31 @@ def search(folder, machine, case: str):
     return jaxid.discover(folder / "case.toml", folder / "log.csv", validate=[folder / "other.csv"])
 
 
+@pytest.fixture(scope="module")
+def rigid(tmp_path_factory):
+    """Search for what the rigid model of the flexible axis lacks."""
+    return search(tmp_path_factory.mktemp("rigid"), axes.machine(), axes.rigid_text())
+
+
 @pytest.mark.slow
-def test_names_the_flexibility_that_a_rigid_model_lacks(tmp_path):
-    found = search(tmp_path, axes.machine(), axes.rigid_text())
-    assert found.kinds == ["joint_flexibility"]
-    swing = derived_json(found.session, found.after)["derived"]["natural_frequency"]["value"]
+def test_names_the_flexibility_that_a_rigid_model_lacks(rigid):
+    assert rigid.kinds == ["joint_flexibility"]
+    swing = derived_json(rigid.session, rigid.after)["derived"]["natural_frequency"]["value"]
     assert swing == pytest.approx(FREQUENCY, rel=0.03)
 
-    baseline, named = found.rounds[:2]
+    baseline, named = rigid.rounds[:2]
     assert named.step.added.candidate.kind == "joint_flexibility"
     assert named.validation[0] < 0.4 * baseline.validation[0]
-    # The effect has no friction of the load: the refit in positions loses some of the gain in forces.
-    before, after = (gaps[-1].simulation.rms[0] for gaps in (found.gaps_before, found.gaps_after))
+    before, after = (gaps[-1].simulation.rms[0] for gaps in (rigid.gaps_before, rigid.gaps_after))
     assert after < 0.4 * before
-    assert not any("complete for this log" in line for line in found.findings)
+    assert not any("complete for this log" in line for line in rigid.findings)
+
+
+# The effect has no friction of the load. The refit, by positions, trades some of the gain in forces for them.
+@pytest.mark.slow
+@pytest.mark.xfail(reason="known miss, 2026-11-27: the refit leaves 0.401 of the force gap", strict=True)
+def test_the_refit_keeps_the_gain_in_forces(rigid):
+    assert rigid.gaps_after[-1].force.rms[0] < 0.4 * rigid.gaps_before[-1].force.rms[0]
 
 
 @pytest.mark.slow
