@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxid.discovery import candidates as cand
+from jaxid.discovery.points import grid_points, start_points
 
 Wanted = Sequence[int] | np.ndarray | None
 
@@ -74,7 +75,7 @@ class ForceDomain:
         self, rest: list[cand.Candidate], samples: Any, theta: np.ndarray, residual: np.ndarray
     ) -> list[cand.Point]:
         """Linearise candidates; see `Domain`."""
-        points = cand.points(self.superset, rest, samples, theta, residual)
+        points = start_points(self.superset, rest, samples, theta, residual)
         for c in rest:
             if c.has_grid:
                 points.extend(self.grid(c, samples))
@@ -84,7 +85,7 @@ class ForceDomain:
         """Linearise a candidate at its many starts; the result is kept, since no other effect enters it."""
         key = (candidate.kind, candidate.port, len(candidate.starts))
         if key not in self._grids:
-            self._grids[key] = cand.grid_points(self.superset, candidate, samples)
+            self._grids[key] = grid_points(self.superset, candidate, samples)
         return self._grids[key]
 
     def noisier(self, samples: Any, theta: np.ndarray) -> np.ndarray:

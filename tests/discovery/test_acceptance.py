@@ -1,4 +1,4 @@
-"""What an effect is worth: the colour of the sensors' noise, and what only seems to explain."""
+"""Evidence for an effect: the colour of the sensors' noise, and what only seems to explain."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -11,6 +11,7 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery.acceptance import Acceptance
 from jaxid.discovery.evidence import Whitener, flipped, stretch
 from jaxid.discovery.noise import NUMERICS, fit_whitener, sensor_colour
+from jaxid.discovery.points import start_points
 from jaxid.discovery.screen import has_influence
 from jaxid.discovery.search import Model
 from jaxid.discovery.where import _bin_offset, _in_words, _loud
@@ -216,7 +217,7 @@ def test_many_starts_are_evaluated_once(axis, monkeypatch):
     _, search = axis
     cogging = next(c for c in search.superset.candidates if c.has_grid)
     first = search.domain.grid(cogging, search.samples)
-    monkeypatch.setattr(cand, "grid_points", lambda *a: pytest.fail("evaluated again"))
+    monkeypatch.setattr("jaxid.discovery.domain.grid_points", lambda *a: pytest.fail("evaluated again"))
     assert search.domain.grid(cogging, search.samples) is first
 
 
@@ -268,7 +269,7 @@ def test_a_limit_that_no_sample_reaches_has_no_influence(tmp_path):
     far = dataclasses.replace(saturation, starts=np.array([1.2 * saturation.starts[0]]))
     near = dataclasses.replace(saturation, starts=np.array([0.7 * saturation.starts[0]]))
     influence = [
-        has_influence(*cand.points(search.superset, [c], search.samples, search.theta, e), counts, scale)
+        has_influence(*start_points(search.superset, [c], search.samples, search.theta, e), counts, scale)
         for c in (far, near)
     ]
     assert influence == [False, True]
