@@ -1,6 +1,7 @@
 """The demo: its logs come from the stepper, it ships, and it finds what was hidden in it."""
 
 import json
+import re
 import tomllib
 from importlib import resources
 from pathlib import Path, PurePosixPath
@@ -61,9 +62,10 @@ def test_the_demo_finds_what_was_hidden(tmp_path, capsys):
     assert found["verdict"] == "found"
     (effect,) = found["effects"]
     assert effect["kind"] == "cogging"
+    values = dict(effect["parameters"])
     for name, true in make_demo.HIDDEN.items():
-        told = effect["parameters"][name]
-        assert abs(told["value"] - true) < max(3 * told["std"], 0.03 * abs(true)), name
+        assert abs(values[name]["value"] - true) < max(3 * values[name]["std"], 0.03 * abs(true)), name
+
     assert found["gap"]["on"] == "validation"
     assert found["gap"]["after"] < 0.1 * found["gap"]["before"]
     # The fit with the effect simulates better in the loop, on the log that it has not seen.
@@ -71,3 +73,24 @@ def test_the_demo_finds_what_was_hidden(tmp_path, capsys):
     assert found["gap"]["simulation"]["after"] < 0.1 * found["gap"]["simulation"]["before"]
     assert "inverse dynamics" not in " ".join(found["notes"])
     assert "cogging" in (folder / "report.html").read_text("utf-8")
+
+    # The intervals of all values hold.
+    machine = make_demo.emps_like(1).machine
+    true = {f"{kind}.{name}": value for kind, own in machine.effects.items() for name, value in own.items()}
+    true |= {"inertia": machine.inertia} | {f"cogging.{name}": x for name, x in make_demo.HIDDEN.items()}
+    fitted = found["parameters"] | {f"cogging.{name}": value for name, value in values.items()}
+    assert fitted.keys() == true.keys()
+    for name, value in fitted.items():
+        assert abs(value["value"] - true[name]) < 3.5 * value["std"], name
+
+    # README shows this output, and these two values.
+    page = (ROOT / "README.md").read_text("utf-8")
+    shown = page.split("$ jaxid discover jaxid-demo/case.toml jaxid-demo/log.csv\n")[1].split("```")[0]
+    assert [line for line in shown.splitlines() if line not in out.splitlines()] == []
+    stated = re.search(r"amplitude (\S+) ± (\S+) N, period (\S+) ± (\S+) mm", page)
+    assert stated is not None
+    exact = [values["amplitude"], {k: 1e3 * values["period"][k] for k in ("value", "std")}]
+    numbers = [value[k] for value in exact for k in ("value", "std")]
+    # To the last digit that stands there; a processor may round another way.
+    for text, number in zip(stated.groups(), numbers, strict=True):
+        assert float(text) == pytest.approx(number, abs=2 * 10.0 ** -len(text.split(".")[1]))
