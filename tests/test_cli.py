@@ -270,6 +270,16 @@ def test_a_piped_process_prints_its_result_alone(tmp_path, files):
     assert held(files[0].parent) == before
 
 
+def test_a_reader_who_leaves_loses_no_result(tmp_path, files):
+    reading, writing = os.pipe()
+    os.close(reading)
+    argv = [*ENTRY, "check", *map(str, files), "-o", str(tmp_path / "out")]
+    ended = subprocess.run(argv, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (ended.returncode, ended.stderr) == (1, "")
+    assert (tmp_path / "out" / "check.json").exists()
+
+
 def test_a_reader_who_leaves_is_no_accident():
     reading, writing = os.pipe()
     os.close(reading)

@@ -28,5 +28,4 @@ def run(args: argparse.Namespace) -> int:
         from jaxid.commands.check import check
 
         result = check(case, logs_of(args))
-    print(result)
     return save_result(args, result, "check.json", made=made)

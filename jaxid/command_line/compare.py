@@ -39,5 +39,4 @@ def run(args: argparse.Namespace) -> int:
         from jaxid.commands.compare import compare
 
         result = compare(args.case, args.log or None, max_changes=args.max_changes, progress=show)
-    print(result)
     return save_result(args, result, *files)

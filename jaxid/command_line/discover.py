@@ -69,7 +69,6 @@ def run(args: argparse.Namespace) -> int:
             experiments=args.experiments,
             progress=show,
         )
-    print(result)
     from jaxid.results.as_json import discovery_files
 
     return save_result(args, result, *discovery_files(result, Path(args.o or ".")), made=made)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+from functools import partial
 
 from jaxid.command_line.inputs import (
     first_case_files,
@@ -95,8 +95,6 @@ def run(args: argparse.Namespace) -> int:
             validate=args.validate,
             progress=show,
         )
-    print(result)
-    status = save_result(args, result, *files, made=made)
-    if made is not None and args.o is not None and result.session.machine.unforced(result.session.fit.log):
-        print(made.save_servos(result, Path(args.o)))
-    return status
+    without_force = result.session.machine.unforced(result.session.fit.log)
+    servos = partial(made.save_servos, result) if made is not None and without_force else None
+    return save_result(args, result, *files, made=made, then=servos)

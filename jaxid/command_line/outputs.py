@@ -56,19 +56,35 @@ def picture_file(name: str, *, overwrite: bool) -> Path:
     return ready_file(path, overwrite=overwrite, suffix=suffix)
 
 
-def save_result(args: argparse.Namespace, result: Savable, *files: str, made: RobotCase | None = None) -> int:
-    """Save a result where the user wants it, and return the exit status.
+def save_result(
+    args: argparse.Namespace,
+    result: Savable,
+    *files: str,
+    made: RobotCase | None = None,
+    then: Callable[[Path], str] | None = None,
+) -> int:
+    """Save a result where the user wants it, print it, and return the exit status.
+
+    It is saved first: the reader of the output, such as `head`, may end before the text does.
 
     Args:
         args: Arguments of the command.
-        result: The result.
+        result: The result, which prints as text.
         files: Names of the files that it writes.
         made: The case that was made from a robot's file, saved beside the result.
+        then: Function that writes more files to the folder of the saved result, and returns text to print.
     """
+    written, more = [], None
     if args.o is not None:
         result.save(args.o, overwrite=args.force)
         written = [str(Path(args.o) / f) for f in files]
         if made is not None:
             written.append(str(made.save(Path(args.o))))
+        more = None if then is None else then(Path(args.o))
+
+    print(result)
+    if written:
         print(f"\nwrote {', '.join(written)}")
+    if more is not None:
+        print(more)
     return 0 if getattr(result, "converged", True) else 1
