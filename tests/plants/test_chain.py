@@ -17,7 +17,8 @@ from jaxid.commands.discover import discover
 from jaxid.commands.identify import identify
 from jaxid.commands.simulate import simulate
 from jaxid.discovery.candidates import CandidateSamples as SearchSamples
-from jaxid.discovery.candidates import evaluate, points
+from jaxid.discovery.candidates import evaluate
+from jaxid.discovery.points import start_points
 from jaxid.discovery.superset import build_candidate_model
 from jaxid.dynamics.dry_friction import set_valued_step
 from jaxid.dynamics.rhs import State, acceleration, hold_polynomial
@@ -426,8 +427,10 @@ def test_shared_columns_are_those_of_each_unknown(tmp_path):
     e, _ = evaluate(union, samples, theta)
     c = next(c for c in union.candidates if c.label == "saturation[2]")
     rivals = [c for c in union.candidates if c.kind == "saturation"]
-    (alone,) = (p for p in points(union, [c], samples, theta, e) if p.start == 3)
-    (among,) = (p for p in points(union, rivals, samples, theta, e) if p.start == 3 and p.candidate is c)
+    (alone,) = (p for p in start_points(union, [c], samples, theta, e) if p.start == 3)
+    (among,) = (
+        p for p in start_points(union, rivals, samples, theta, e) if p.start == 3 and p.candidate is c
+    )
     np.testing.assert_allclose(alone.offset, among.offset, atol=1e-9)
 
 
