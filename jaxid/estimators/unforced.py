@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxid.consistency.absent import without_scale
 from jaxid.controllers.linear import PD, PID, CascadePD
@@ -21,6 +20,7 @@ from jaxid.estimators.apart.whole import arm_steps, start_by_joints, whole_steps
 from jaxid.estimators.coarse_starts import coarse_starts
 from jaxid.estimators.effort import SCALE, Scale, scale_by_effort
 from jaxid.estimators.estimate import Estimate, misfit
+from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
@@ -29,8 +29,7 @@ from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER
 from jaxid.numerics.lanes import Steps
 from jaxid.numerics.precision import Precision, assess
-from jaxid.simulation.noisy_loop import ReadingNoise, estimated_noise
-from jaxid.simulation.replay import Numerics, make_replay
+from jaxid.simulation.replay import Numerics
 from jaxid.simulation.sensor_noise import position_noise
 
 if TYPE_CHECKING:
@@ -38,8 +37,6 @@ if TYPE_CHECKING:
 
 # Starts from which logs that are fitted together are fitted; each fit simulates all of them many times.
 _STARTS_TOGETHER = 2
-# Number of times that the noise of the encoder is estimated, and the unknowns refitted.
-_RENEWALS = 2
 # Keys of each law that give its command a scale; without one that is known, the scale is free.
 _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
 
@@ -76,7 +73,6 @@ def unforced_steps(
         fits.append((yield from fit(fitted, parts, start=start, numerics=numerics, **options)))
     result = min(fits, key=lambda e: (not e.converged, misfit(e)))
     if len(parts) == 1 and result.converged and by_joints is None:
-        # The noise of every joint of an arm takes ten times as long, and moves the estimates by little.
         noisy = yield from fitted_with_noise(fitted, parts[0].log, result.theta, numerics=numerics, **options)
         result = noisy or result
     if base is None:
@@ -281,43 +277,6 @@ def free_precision(old: Precision, machine: Machine, group: tuple[int, ...], bas
 def _with_gap(values: np.ndarray | None, base: int) -> np.ndarray | None:
     """Return values of all unknowns, with NaN for the one that was held."""
     return None if values is None else np.insert(values, base, np.nan)
-
-
-def fitted_with_noise(
-    machine: Machine, log: Log, start: Float[np.ndarray, " p"], **options: Any
-) -> Steps[Estimate | None]:
-    """Fit the mean readings of a loop whose controller reads a noisy encoder.
-
-    Args:
-        machine: The machine.
-        log: The log.
-        start: Values of the unknowns near the optimum, at which the noise is estimated first.
-        options: Further arguments of `output_error_steps`.
-
-    Returns:
-        The estimate; None if nothing is known of the noise, or the fit does not converge.
-    """
-    best: Estimate | None = None
-    if options.get("on", "position") != "position":
-        return None
-    for _ in range(_RENEWALS):
-        at = machine.with_estimate(start if best is None else best.theta)
-        numerics = options.get("numerics") or choose_numerics(at, log)
-        noise = estimated_noise(at, log, make_replay(at, log, numerics))
-        if noise is None:
-            return best
-        new = yield from output_error_steps(machine, log, start=at.parameters.guess, noise=noise, **options)
-        if not new.converged:
-            return best
-        best = replace(new, notes=(*new.notes, _words(noise)))
-    return best
-
-
-def _words(noise: ReadingNoise) -> str:
-    """Return the note on the noise with which a loop was simulated."""
-    std = ", ".join(f"{s:.2g}" for s in noise.std)
-    counts = " and rounding to counts" if np.any(noise.count > 0) else ""
-    return f"the loop reads its encoder with noise of {std} (standard deviation){counts}: the mean is fitted"
 
 
 def precision_at_guesses(machine: Machine, log: Log) -> Precision:

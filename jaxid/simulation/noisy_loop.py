@@ -138,7 +138,12 @@ def _opposite(replay: Replay, most: int) -> Float[np.ndarray, "draws ticks n"]:
 
 
 def estimated_noise(
-    machine: Machine, log: Log, replay: Replay, *, follows: bool = True
+    machine: Machine,
+    log: Log,
+    replay: Replay,
+    *,
+    follows: bool = True,
+    before: ReadingNoise | None = None,
 ) -> ReadingNoise | None:
     """Estimate the noise of the encoder in a loop, and the start of its run, at a machine's values.
 
@@ -150,11 +155,12 @@ def estimated_noise(
         log: The log of positions.
         replay: The loop without noise.
         follows: See `ReadingNoise`.
+        before: Noise at values nearby, next to which levels are tried; None: all are.
 
     Returns:
         The noise; None if the log has velocities in place of positions, or no reading has any noise.
     """
-    found = _noise_in_loop(machine, log, replay, follows)
+    found = _noise_in_loop(machine, log, replay, follows, before)
     if found is None:
         return None
     noise, loop = found
@@ -163,7 +169,7 @@ def estimated_noise(
 
 
 def _noise_in_loop(
-    machine: Machine, log: Log, replay: Replay, follows: bool
+    machine: Machine, log: Log, replay: Replay, follows: bool, before: ReadingNoise | None = None
 ) -> tuple[ReadingNoise, _Loop] | None:
     """Return the noise of `estimated_noise` without its shift, and the loop at the machine's values."""
     if log.integrated or replay.controller is None:
@@ -183,10 +189,22 @@ def _noise_in_loop(
         levels = [np.broadcast_to(np.asarray(known), n) * measured]
     replay = replay.following(machine.parameters.places, jnp.asarray(machine.parameters.guess))
     loop = _Loop.of(machine.plant, log, replay)
-    begun = [ReadingNoise(count, levels[0], np.zeros(2 * n), rest, follows=follows) for rest in (False, True)]
-    noises = [loop.started(loop.at_best_level(noise, levels)) for noise in begun]
+    if before is not None:
+        near = loop.started(replace(before, shift=None))
+        return loop.at_best_level(near, _levels_beside(before.std, levels)), loop
+
+    begun = loop.at_best_level(ReadingNoise(count, levels[0], np.zeros(2 * n), follows=follows), levels)
+    noises = [loop.started(replace(begun, rest=rest)) for rest in (False, True)]
     noise = min(noises, key=lambda noise: float(np.sum(loop.squares(noise))))
     return loop.at_best_level(noise, levels), loop
+
+
+def _levels_beside(std: Float[np.ndarray, " n"], levels: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the level of each joint, the one below and the one above, among those that are tried."""
+    tried, last = np.stack(levels), len(levels) - 1
+    own = np.argmin(np.abs(tried - std), axis=0)
+    places = [np.clip(own + step, 0, last) for step in (-1, 0, 1)] if last else [own]
+    return [tried[place, np.arange(std.size)] for place in places]
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,9 @@ def test_all_servos_are_found_from_guesses_two_to_five_times_off(drawn, columns)
     assert np.max(leaves(drawn, estimate)) < 1.4
     assert np.all(np.abs(estimate.theta - truth) < 4 * estimate.std)
     assert np.all(np.abs(estimate.theta / truth - 1) < 0.05)
-    assert "all joints were fitted at once" in " ".join(estimate.notes)
+    notes = " ".join(estimate.notes)
+    assert "all joints were fitted at once" in notes
+    assert "the mean is fitted" in notes
 
 
 @pytest.mark.slow
@@ -105,3 +107,11 @@ def test_most_intervals_hold_on_another_arm():
     assert fit["converged"]
     assert len(fit["z"]) == 12
     assert max(map(abs, fit["z"].values())) < 4.0
+
+
+@pytest.mark.slow
+def test_noise_that_goes_round_the_loop_is_in_the_fitted_mean():
+    """A fit without it takes 0.2 % of a gain and 0.3 % of a delay for noise: 3 standard deviations of each."""
+    fit = covered(of("arm_coverage", 13))
+    assert fit["converged"]
+    assert max(map(abs, fit["z"].values())) < 2.5

@@ -28,10 +28,11 @@ from jaxid.estimators import steps_of
 from jaxid.estimators.coarse_starts import coarse_starts, points_about
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import parts_of
 from jaxid.estimators.simulated_output import choose_numerics
-from jaxid.estimators.unforced import common_scale_group, fitted_with_noise, with_free_scale, without
+from jaxid.estimators.unforced import common_scale_group, with_free_scale, without
 from jaxid.gap import Gap, gaps
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared

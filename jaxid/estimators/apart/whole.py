@@ -25,6 +25,7 @@ from jaxid.estimators.apart.loads import with_simulated_loads
 from jaxid.estimators.apart.start import starts_beside
 from jaxid.estimators.apart.steps import TOLERANCE, apart_steps, common_numerics, joint_fits, side_by_side
 from jaxid.estimators.estimate import Estimate, misfit
+from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import Part
 from jaxid.estimators.simulated_output import choose_numerics
@@ -85,7 +86,8 @@ def whole_steps(
     """Fit all unknowns of an arm at once, from some values and from better ones that the fit leads to.
 
     These are the ticks nearest to its delays, because between two ticks dry friction may hold a fit; and,
-    while more than noise is left, fits of the joints alone under the forces of the arm in simulation.
+    while more than noise is left, fits of the joints alone under the forces of the arm in simulation. A log
+    alone of which no more than noise is left is fitted by the mean readings of the loop with this noise.
 
     Args:
         machine: Machine of all logs.
@@ -107,6 +109,10 @@ def whole_steps(
         best = min(best, new, key=_rank)
         if not gained > _NEWS * abs(misfit(best)):
             break
+    if len(parts) == 1 and best.converged and not _leaves_more_than_noise(best, parts):
+        # One run without noise, shifted: the noise of every joint in each run takes ten times as long.
+        noisy = yield from fitted_with_noise(machine, parts[0].log, best.theta, follows=False, **options)
+        best = noisy or best
     return replace(best, notes=(_NOTE, *best.notes))
 
 
