@@ -111,7 +111,7 @@ def test_most_intervals_hold_on_another_arm():
 
 @pytest.mark.slow
 def test_noise_that_goes_round_the_loop_is_in_the_fitted_mean():
-    """A fit without it takes 0.2 % of a gain and 0.3 % of a delay for noise: 3 standard deviations of each."""
+    """Without it 0.2 % of a gain and 0.3 % of a delay are noise: 3 standard deviations of each."""
     fit = covered(of("arm_coverage", 13))
     assert fit["converged"]
     assert max(map(abs, fit["z"].values())) < 2.5
