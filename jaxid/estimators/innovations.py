@@ -75,7 +75,13 @@ def fit(problem: Innovations, theta: Array, noise: Array, max_steps: Array) -> S
 def fit_steps(problem: Innovations, theta: Array, noise: Array, max_steps: int) -> Steps[Scored]:
     """Run `fit` as a solve request; the result holds arrays of numpy, with which nothing more is compiled."""
     # Joints that push each other share the steps in which one of them turns, which take many times as long.
-    request = SolveRequest(fit, (problem, theta, noise, np.asarray(max_steps)), alone=problem.plant.coupled)
+    # Side by side every fit takes them at every sample, and so it is behind a lag and under friction with
+    # memory, where the force changes within a step.
+    commands = np.zeros(problem.kalman.command.shape[1])
+    remembers = bool(jax.tree.leaves(problem.plant.initial_states(commands)))
+    request = SolveRequest(
+        fit, (problem, theta, noise, np.asarray(max_steps)), alone=problem.plant.coupled or remembers
+    )
     scored = yield request
     return jax.tree.map(np.asarray, scored)
 

@@ -159,6 +159,15 @@ class JointLikelihood:
         members = [replace(m, problem=m.problem._replace(low=m.at.floors[floor])) for m in self.members]
         return replace(self, members=tuple(members))
 
+    def at_quietest(self) -> JointLikelihood | None:
+        """Return the likelihood with the lowest floors of the noise; None if a log has no lower ones."""
+        members = []
+        for member in self.members:
+            if member.at.quietest is None:
+                return None
+            members.append(replace(member, problem=member.problem._replace(low=member.at.quietest)))
+        return replace(self, members=tuple(members))
+
     def sticks_surely(self, noises: Sequence[np.ndarray]) -> list[bool]:
         """Check for each log that its noise is so small that it is known when a joint sticks."""
         return [m.at.sticks_surely(noise) for m, noise in zip(self.members, noises, strict=True)]

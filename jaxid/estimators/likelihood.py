@@ -31,6 +31,8 @@ _FORCE_NOISE = 0.1
 # and above the error of the steps at reversals, which is larger where joints push each other or friction
 # changes with speed.
 _FLOORS, _LOWEST = (1e-2, 1e-3, 1e-4), 1e-5
+# That of a fit with the samples at rest, whose steps are finer.
+_QUIETEST = 1e-6
 # Largest noise of the force, as a part of it; noise of a reading, as a multiple of its first estimate.
 _MOST, _READING_RANGE = 1e2, (1e-3, 1e3)
 # Noise of the force, as a part of it, below which sticking is certain.
@@ -60,6 +62,8 @@ class Likelihood:
         force: Size of the logged force, (m,).
         noise: Logarithms of the noise at the start, of the force and then of the readings, (m + k,).
         floors: Lower bounds on them, in turn.
+        quietest: Lower bounds on them in a fit with the samples at rest that has come to the last of these;
+            None: there are no lower ones.
     """
 
     problem: Innovations
@@ -72,6 +76,7 @@ class Likelihood:
     force: np.ndarray
     noise: np.ndarray
     floors: Sequence[np.ndarray]
+    quietest: np.ndarray | None
 
     def sticks_surely(self, noise: np.ndarray) -> bool:
         """Check that there is so little noise of the force that it is known when a joint sticks."""
@@ -150,6 +155,7 @@ def likelihood_of(
         force=force,
         noise=noise,
         floors=floors,
+        quietest=None if rough else np.log(np.concatenate([_QUIETEST * force, _READING_RANGE[0] * reading])),
     )
 
 

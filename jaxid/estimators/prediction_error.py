@@ -157,7 +157,7 @@ def prediction_error_steps(
     else:
         estimate = _estimate(fit, end, theta, reads)
     if estimate.converged:
-        estimate = yield from _with_bound_at_truth(estimate, fit, lowest.noises)
+        estimate = yield from _with_bound_at_truth(estimate, fit, end.noises)
     if hessian:
         estimate = yield from _by_hessian(estimate, fit, end)
     if profile:
@@ -260,9 +260,24 @@ def _with_samples_at_rest(fit: JointLikelihood, end: Maximum) -> Steps[tuple[Joi
         steps += other.steps
         still = [s and after for s, after in zip(sure, fit.sticks_surely(other.noises), strict=True)]
         if still == sure:
-            return rested, replace(other, steps=steps)
+            return (yield from _quieter(rested, replace(other, steps=steps)))
         sure = still
     return fit, replace(end, steps=steps)
+
+
+def _quieter(fit: JointLikelihood, end: Maximum) -> Steps[tuple[JointLikelihood, Maximum]]:
+    """Return a fit whose noise of the force came to its floor with a lower one, if it converges there too.
+
+    The standard deviations are those of the noise at the floor, and too large by as much as it is too high.
+    """
+    quiet = fit.at_quietest()
+    if quiet is None or not end.converged or fit.above(-1, end):
+        return fit, end
+    other = yield from quiet.fit(end.theta, end.noises, STEPS)
+    steps = end.steps + other.steps
+    if not other.converged:
+        return fit, replace(end, steps=steps)
+    return quiet, replace(other, steps=steps)
 
 
 def _with_bound_at_truth(
