@@ -24,6 +24,7 @@ from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
+from jaxid.estimators.ticks import starts_beside, with_std_of_ticks
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 # Starts from which logs that are fitted together are fitted; each fit simulates all of them many times.
 _STARTS_TOGETHER = 2
+# Misfit of a fit without noise, as a multiple of the best one's, up to which its mean readings are compared.
+_NEARLY = 1.5
 # Keys of each law that give its command a scale; without one that is known, the scale is free.
 _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
 
@@ -46,7 +49,9 @@ def unforced_steps(
 ) -> Steps[Estimate]:
     """Fit the positions of loops whose force was not logged, from several starts, to one log or to several.
 
-    An arm of servos starts from fits of each joint alone, see `jaxid.estimators.apart`.
+    An arm of servos starts from fits of each joint alone, see `jaxid.estimators.apart`. If the case states
+    the period of the loop, no delay has a smaller standard deviation than that of a uniform error of one
+    period.
 
     Args:
         session: Case and logs of the fit.
@@ -54,6 +59,16 @@ def unforced_steps(
         scaled: Whether an effort of known gain gives the scale, if nothing else does.
         options: Further arguments of `output_error_steps`.
     """
+    result = yield from _fitted_steps(session, numerics, scaled, **options)
+    controller = session.case.controller
+    stated = controller is not None and controller.period is not None
+    return with_std_of_ticks(result) if stated else result
+
+
+def _fitted_steps(
+    session: Session, numerics: Numerics | None, scaled: bool, **options: Any
+) -> Steps[Estimate]:
+    """Fit as `unforced_steps` does, for its arguments."""
     machine = session.machine
     if stands_apart(machine, parts_of(session)):
         return (yield from arm_steps(machine, parts_of(session), numerics=numerics, **options))
@@ -73,14 +88,41 @@ def unforced_steps(
         fits.append((yield from fit(fitted, parts, start=start, numerics=numerics, **options)))
     result = min(fits, key=lambda e: (not e.converged, misfit(e)))
     if len(parts) == 1 and result.converged and by_joints is None:
-        noisy = yield from fitted_with_noise(fitted, parts[0].log, result.theta, numerics=numerics, **options)
-        result = noisy or result
+        result = yield from _by_mean_readings(fitted, parts[0].log, result, numerics=numerics, **options)
     if base is None:
         return result
     scale = scale_by_effort(session, parts, result) if scaled else None
     if scale is not None:
         return with_known_scale(result, machine, group, base, scale)
     return with_free_scale(result, machine, group, base)
+
+
+def _by_mean_readings(machine: Machine, log: Log, plain: Estimate, **options: Any) -> Steps[Estimate]:
+    """Return the best fit of the mean readings, near a fit without noise and at the ticks beside its delay.
+
+    A command that is held over several ticks leaves a minimum at each of them. The noise changes the misfit
+    by more than one tick of the delay does, so that only mean readings show which is the best.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        plain: A fit without noise.
+        options: Further arguments of `output_error_steps`.
+
+    Returns:
+        The fit; that without noise if nothing is known of the noise.
+    """
+    found = yield from fitted_with_noise(machine, log, plain.theta, **options)
+    if found is None:
+        return plain
+    for start in starts_beside(machine, found.theta):
+        near = yield from output_error_steps(machine, log, start=start, **options)
+        if not near.converged or misfit(near) > _NEARLY * misfit(plain):
+            continue
+        other = yield from fitted_with_noise(machine, log, near.theta, **options)
+        if other is not None and misfit(other) < misfit(found):
+            found = other
+    return found
 
 
 def common_scale_group(machine: Machine, parts: Sequence[Part]) -> tuple[int, ...]:

@@ -29,8 +29,8 @@ from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import Part
 from jaxid.estimators.simulated_output import choose_numerics
+from jaxid.estimators.ticks import at_ticks
 from jaxid.machine import Machine
-from jaxid.model.unknowns import CONTROLLER
 from jaxid.numerics.lanes import Steps
 from jaxid.simulation.replay import Numerics
 from jaxid.simulation.sensor_noise import position_noise
@@ -125,7 +125,7 @@ def _to_ticks(
 ) -> Steps[Estimate]:
     """Return the better of a fit from some values, and one from the ticks next to its delays."""
     first = yield from output_error_steps(machine, parts, start=start, **options)
-    ticks = _at_ticks(machine, first.theta)
+    ticks = at_ticks(machine, first.theta)
     if np.array_equal(ticks, first.theta):
         return first
     return min(first, (yield from output_error_steps(machine, parts, start=ticks, **options)), key=_rank)
@@ -184,13 +184,6 @@ def _of_joints(machine: Machine, parts: Sequence[Part], own: Sequence[int]) -> t
         index = np.array([new[part.index[n]] for n in kept], int)
         out.append(replace(part, machine=chosen(part.machine, kept), index=index))
     return chosen(machine, own), out
-
-
-def _at_ticks(machine: Machine, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Return values with each unknown delay at the nearest tick of the loop."""
-    law, delays = machine.controller, [f.path == (CONTROLLER, "delay") for f in machine.parameters.free]
-    assert law is not None, "checked by stands_apart"
-    return np.where(delays & np.isfinite(theta), np.round(theta / law.period) * law.period, theta)
 
 
 def start_by_joints(machine: Machine, parts: Sequence[Part]) -> Steps[Float[np.ndarray, " p"] | None]:
