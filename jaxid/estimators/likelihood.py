@@ -43,6 +43,9 @@ _BEGINS = 4
 # Steps of the last fit of such a log for each one before, and least number with a lag in the drive or with
 # friction that changes with speed.
 _FINER = 4
+# Factor on the steps that the fastest rate needs, in the last fit: the error of a joint that comes to rest within
+# a step behind a spring grows with the square of that step.
+_FINER_BY_RATE = 16.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,10 @@ class Likelihood:
     def at_rest_too(self, problem: Innovations) -> Innovations:
         """Return the likelihood with the samples at rest."""
         # So precise a fit shows the error of a step in which a joint comes to rest.
-        finer = replace(self.numerics, substeps=_FINER * self.numerics.substeps)
+        steps = _FINER * self.numerics.substeps
+        if not self.machine.plant.coupled:  # joints that push each other take too long with still more
+            steps = max(steps, needed_steps(self.machine, self.log, finer=_FINER_BY_RATE))
+        finer = replace(self.numerics, substeps=steps)
         offset = None if self.law is None else self.law.offset
         kalman = make_filter(self.machine, self.log, finer, self.unsure, offset)
         return problem._replace(kalman=kalman, counts=_counted(kalman, self.log, self.unsure))

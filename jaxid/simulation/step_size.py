@@ -37,8 +37,13 @@ class TooStiffError(InputError):
     """Error for a machine so stiff, or so light, that its simulation would not end."""
 
 
-def needed_steps(machine: Machine, log: Log) -> int:
+def needed_steps(machine: Machine, log: Log, *, finer: float = 1.0) -> int:
     """Return the integration steps per sample that the smooth part of the plant needs along a log.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        finer: Factor on the steps.
 
     Raises:
         TooStiffError: If that is more than any plausible machine needs.
@@ -46,7 +51,7 @@ def needed_steps(machine: Machine, log: Log) -> int:
     period = machine.controller.period if machine.controller is not None else log.period
     picks = np.linspace(0, log.samples - 1, 50).astype(int)
     q, u = log.filled[picks], log.force[picks] * np.asarray(machine.gain)
-    steps = float(fastest_rate(machine.plant, q, u)) * period / _FINE
+    steps = finer * float(fastest_rate(machine.plant, q, u)) * period / _FINE
     if not np.isfinite(steps):
         raise TooStiffError(
             "the plant's forces have no finite slope where the log begins to move",
