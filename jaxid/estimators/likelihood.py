@@ -43,8 +43,8 @@ _BEGINS = 4
 # Steps of the last fit of such a log for each one before, and least number with a lag in the drive or with
 # friction that changes with speed.
 _FINER = 4
-# Factor on the steps that the fastest rate needs, in the last fit: the error of a joint that comes to rest within
-# a step behind a spring grows with the square of that step.
+# Factor on the steps that the fastest rate needs, in the last fit: the error of a joint that comes to rest
+# behind a spring within a step grows with the square of that step.
 _FINER_BY_RATE = 16.0
 
 
