@@ -105,11 +105,14 @@ def _likelihood(session: Session, estimate: Estimate) -> tuple[Likelihood, np.nd
         start=estimate.theta,
         rest_velocity=np.asarray(run.data.recipe.rest_velocity),
     )
-    problem = made.problem._replace(low=made.floors[-1])
+    found, low = np.log(np.concatenate([noise["force"], of_readings])), made.floors[-1]
+    if made.quietest is not None and np.any(found < low):
+        low = made.quietest
+    problem = made.problem._replace(low=low)
     if int(problem.counts.sum()) != estimate.samples:
         # The fit ended with the samples at rest.
         problem = made.at_rest_too(problem)
-    return replace(made, problem=problem), np.log(np.concatenate([noise["force"], of_readings]))
+    return replace(made, problem=problem), found
 
 
 @kept_jit

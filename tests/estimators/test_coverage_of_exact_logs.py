@@ -96,3 +96,15 @@ def test_the_noise_of_a_force_that_the_law_explains_falls_below_the_floors_befor
     # Where a fit at the lowest floor does not converge, that of the floor before counts.
     assert noise[0] < 0.5e-5
     assert noise[1] < 2e-5
+
+
+@pytest.mark.slow
+def test_an_exact_posterior_has_the_noise_of_its_fit(tmp_path):
+    """Above the floor that the fit had left behind it was 1.6 times as wide."""
+    text, log, _ = MACHINES["axis"](0, "known", "stated")
+    path = tmp_path / "case.toml"
+    path.write_text(text)
+    result = jaxid.identify(path, log)
+    drawn = result.to_arviz(exact=True)["posterior"]
+    ratio = [float(drawn[name].std()) / found.std for name, found in result.parameters.items()]
+    assert np.all(np.abs(np.log(ratio)) < 0.1)
