@@ -339,10 +339,10 @@ def _corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[tuple[np.ndarr
 
     The filter takes the logged command for the applied one plus an error that is independent of the log.
     Noise of the reading is not independent: like noise of a regressor it makes the force count too little.
-    As much noise again, simulated, has about the same effect once more. The shift of the optimum, by one step of
-    the scoring, is not quite in proportion to the variance that is added: where the shifts by half as much and
-    by as much lie near a line, the parabola through them gives the shift from none. Pairs of opposite noise
-    cancel in first order.
+    As much noise again, simulated, has about the same effect once more. The shift of the optimum, by one step
+    of the scoring, is not quite in proportion to the variance that is added: where the shifts by half as much
+    and by as much lie near a line, the parabola through them gives the shift from none. Pairs of opposite
+    noise cancel in first order.
 
     Args:
         fit: The likelihood.
