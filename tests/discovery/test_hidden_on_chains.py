@@ -239,3 +239,12 @@ def test_a_rival_that_ran_away_gets_no_experiment(tmp_path):
     found = discover(write_case(tmp_path, text_of(case)), logged(case), refit=False)
     assert [e.label for e in found.effects] == ["coulomb_friction[2]"]
     assert not any(p.separates for p in found.proposals)
+
+
+@pytest.mark.slow
+def test_an_experiment_on_three_masses_ends():
+    """The convolution of XLA ended the process while it was designed."""
+    case = next(c for c in cases("new") if c.seed == 9002)
+    found = discover(tomllib.loads(text_of(case)), logged(case), refit=False)
+    assert [e.label for e in found.effects] == ["coulomb_friction[3]"]
+    assert [p.rival for p in found.proposals] == ["hysteresis[3]"]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from jaxid.case.case import load_case
 from jaxid.commands.discover import discover
 from jaxid.discovery.separating import propose as separate
-from jaxid.discovery.separating.rivals import loss
+from jaxid.discovery.separating.rivals import Experiment, loss
 from jaxid.errors import InputError
 from jaxid.experiment_design.improve import improved
 from jaxid.experiment_design.shapes import Shapes, basis
@@ -47,6 +48,14 @@ def springs(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(separate, "loss", watched)
         return setup, proposed_for(setup, declared, SPRINGS, folder, more=setups.WIDER)
+
+
+def test_forces_are_whitened_by_the_filter_of_each_joint():
+    rng = np.random.default_rng(0)
+    e, whiten = rng.standard_normal((50, 3)), rng.standard_normal((3, 11))
+    out = Experiment.white(SimpleNamespace(whiten=jnp.asarray(whiten)), jnp.asarray(e))
+    expected = np.stack([np.convolve(x, w)[:50] for x, w in zip(e.T, whiten, strict=True)], axis=1)
+    np.testing.assert_allclose(out, expected, atol=1e-12)
 
 
 def test_every_signal_of_the_family_keeps_within_its_limits():

@@ -190,8 +190,13 @@ class Experiment(eqx.Module):
 
     def white(self, e: Float[Array, "kept n"]) -> Float[Array, "kept n"]:
         """Whiten a force by the filter of each joint."""
-        columns = [jnp.convolve(x, w)[: x.size] for x, w in zip(e.T, self.whiten, strict=True)]
-        return jnp.stack(columns, axis=1)
+        # No convolution of XLA: with jaxlib 0.10 that of three joints, differentiated, ends the process in a
+        # segmentation fault.
+        order = self.whiten.shape[1] - 1
+        before = jnp.concatenate([jnp.zeros((order, e.shape[1])), e])
+        shifted = [before[order - lag : order - lag + e.shape[0]] for lag in range(order + 1)]
+        terms = (x * w for x, w in zip(shifted, self.whiten.T, strict=True))
+        return sum(terms, start=jnp.zeros_like(e))
 
 
 class ModelPair(eqx.Module):
