@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
+import scipy.optimize
 from jaxtyping import Float
 
 from jaxid.estimators.joint_likelihood import (
@@ -24,24 +25,45 @@ _PAIRS = 4
 _BLIND = 1e-10
 # Largest bend of the shift by that noise, as a part of it, up to which it is a parabola of the variance.
 _BENT = 0.1
+# A value this near to a bound, on the scale of the solver, rests there.
+_AT_BOUND = 1e-9
 
 
-def corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[tuple[np.ndarray, list[np.ndarray]]]:
-    """Remove the bias by noise with which the commands were read; return the estimates and the noise.
+@dataclass(frozen=True)
+class Corrected:
+    """Estimates without the bias by noise with which the commands were read.
+
+    Args:
+        theta: Estimates, (p,).
+        reads: Noise of each log for which they were corrected, (m,).
+        doubt: Difference between two extrapolations to no noise, where the shifts do not decide between them,
+            (p,).
+    """
+
+    theta: Float[np.ndarray, " p"]
+    reads: list[np.ndarray]
+    doubt: Float[np.ndarray, " p"]
+
+    @classmethod
+    def not_at_all(cls, theta: Float[np.ndarray, " p"], drives: Sequence[int]) -> Corrected:
+        """Return estimates as they are, for logs with these numbers of drives."""
+        return cls(theta, [np.zeros(m) for m in drives], np.zeros_like(theta))
+
+
+def corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[Corrected]:
+    """Remove the bias by noise with which the commands were read.
 
     The filter takes the logged command for the applied one plus an error that is independent of the log.
     Noise of the reading is not independent: like noise of a regressor it makes the force count too little.
     As much noise again, simulated, has about the same effect once more. The shift of the optimum, by one step
     of the scoring, is not quite in proportion to the variance that is added: where the shifts by half as much
-    and by as much lie near a line, the parabola through them gives the shift from none. Pairs of opposite
-    noise cancel in first order.
+    and by as much lie near a line, the parabola through them gives the shift from none; elsewhere the line
+    does, and its distance from the parabola shows how well the shift is known. Pairs of opposite noise cancel
+    in first order. A value at a bound stays there while the likelihood without the bias presses it there.
 
     Args:
         fit: The likelihood.
         end: Its maximum.
-
-    Returns:
-        The estimates, (p,), and the noise of each log for which they were corrected, (m,).
 
     Source:
         Cook & Stefanski (1994), JASA 89, simulation-extrapolation.
@@ -49,26 +71,41 @@ def corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[tuple[np.ndarra
     reads = [
         _noise_of_reading(member, end.x[place]) for member, place in zip(fit.members, fit.places, strict=True)
     ]
+    as_it_is = Corrected.not_at_all(end.theta, [m.drives for m in fit.members])
     if not any(np.any(read > 0) for read in reads):
-        return end.theta, reads
-    whole = yield from _shift_steps(fit, end, reads)
-    half = yield from _shift_steps(fit, end, [np.sqrt(0.5) * read for read in reads])
+        return as_it_is
+    pressed = _pressed(fit, end)
+    whole = yield from _shift_steps(fit, end, pressed, reads)
+    half = yield from _shift_steps(fit, end, pressed, [np.sqrt(0.5) * read for read in reads])
     if whole is None or half is None:
-        return end.theta, [np.zeros_like(read) for read in reads]
-    moved = end.x.copy()
-    moved[: fit.unknowns] -= shift_from_none(half, whole)[: fit.unknowns]
-    return np.clip(fit.theta(moved), *fit.machine.parameters.bounds), reads
+        return as_it_is
+
+    # Only the unknowns are corrected; the noises may follow as far as they like.
+    lower, upper = fit.bounds
+    lower[fit.unknowns :], upper[fit.unknowns :] = -np.inf, np.inf
+
+    def without(step: np.ndarray) -> np.ndarray:
+        moved = end.x + whole.taken_back(step, pressed, (lower - end.x, upper - end.x))
+        return np.clip(fit.theta(moved), *fit.machine.parameters.bounds)
+
+    line, parabola, bent = extrapolations(half, whole)
+    by_line, by_parabola = without(line), without(parabola)
+    if bent:
+        return Corrected(by_line, reads, np.abs(by_parabola - by_line))
+    return Corrected(by_parabola, reads, as_it_is.doubt)
 
 
-def shift_from_none(half: Shift, whole: Shift) -> Float[np.ndarray, " q"]:
-    """Return the shift by the noise that a log has, from those by half as much and by as much again.
+def extrapolations(
+    half: Shift, whole: Shift
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"], bool]:
+    """Return the shift by the noise that a log has, by a line and by a parabola, and whether it bends far.
 
-    With a shift of a v + b v^2 by the variance v that is added, it is a - b.
+    They follow from the shifts by half as much and by as much noise again. With a shift of a v + b v^2 by the
+    variance v that is added, the shift from none is a - b.
     """
     bend = 2 * half.step - whole.step
-    if whole.size_of(bend) > _BENT * whole.size_of(whole.step):
-        return whole.step
-    return whole.step + 4 * bend
+    far = whole.size_of(bend) > _BENT * whole.size_of(whole.step)
+    return whole.step, whole.step + 4 * bend, far
 
 
 @dataclass(frozen=True)
@@ -87,6 +124,28 @@ class Shift:
         """Return the length of a step in standard deviations."""
         return float(np.sqrt(max(step @ self.information @ step, 0.0)))
 
+    def taken_back(
+        self,
+        step: Float[np.ndarray, " q"],
+        pressed: Float[np.ndarray, " q"],
+        room: tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]],
+    ) -> Float[np.ndarray, " q"]:
+        """Return the step from the maximum with a shift to that without it, within bounds.
+
+        Args:
+            step: The shift.
+            pressed: Gradient of the negative log-likelihood at the maximum, zero away from bounds.
+            room: Least and largest step.
+        """
+        norm, eigenvalues, vectors = _scaled(self.information)
+        root = np.sqrt(eigenvalues)
+        target = -(vectors.T @ (pressed / norm)) / root - root * (vectors.T @ (step * norm))
+        # Rounding must not put a value that rests at its bound outside.
+        least, most = np.minimum(room[0], 0.0) * norm, np.maximum(room[1], 0.0) * norm
+        most = np.maximum(most, least + np.finfo(np.float64).tiny)
+        matrix = root[:, None] * vectors.T
+        return scipy.optimize.lsq_linear(matrix, target, (least, most), method="bvls").x / norm
+
 
 def _noise_of_reading(member: Member, x: np.ndarray) -> Float[np.ndarray, " m"]:
     """Return the noise with which a log's command was read, at most that of the force; zero without any."""
@@ -96,12 +155,15 @@ def _noise_of_reading(member: Member, x: np.ndarray) -> Float[np.ndarray, " m"]:
     return np.minimum(member.command_noise, np.exp(x[p : p + drives]))
 
 
-def _shift_steps(fit: JointLikelihood, end: Maximum, reads: Sequence[np.ndarray]) -> Steps[Shift | None]:
+def _shift_steps(
+    fit: JointLikelihood, end: Maximum, pressed: np.ndarray, reads: Sequence[np.ndarray]
+) -> Steps[Shift | None]:
     """Return the shift of the maximum by more noise of the commands' reading, by one step of the scoring.
 
     Args:
         fit: The likelihood.
         end: Its maximum.
+        pressed: Gradient there of the values at bounds, which no noise has caused, (q,).
         reads: Noise that is added to the command of each log, (m,).
 
     Returns:
@@ -129,8 +191,32 @@ def _shift_steps(fit: JointLikelihood, end: Maximum, reads: Sequence[np.ndarray]
     if not (np.all(np.isfinite(information)) and np.all(np.isfinite(gradient))):
         return None
 
+    norm, eigenvalues, vectors = _scaled(information)
+    step = vectors @ ((vectors.T @ ((gradient - pressed) / norm)) / eigenvalues)
+    return Shift(-step / norm, information)
+
+
+def _pressed(fit: JointLikelihood, end: Maximum) -> Float[np.ndarray, " q"]:
+    """Return the gradient of the negative log-likelihood by the unknowns that it presses against a bound."""
+    gradient = np.zeros(end.x.size)
+    for place, scored in zip(fit.places, end.scored, strict=True):
+        gradient[place] += scored.gradient
+    lower, upper = fit.bounds
+    rests = ((end.x <= lower + _AT_BOUND) & (gradient > 0)) | ((end.x >= upper - _AT_BOUND) & (gradient < 0))
+    rests[fit.unknowns :] = False
+    return np.where(rests, gradient, 0.0)
+
+
+def _scaled(
+    information: Float[np.ndarray, "q q"],
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " r"], Float[np.ndarray, "q r"]]:
+    """Return the norms, and the eigenvalues and eigenvectors of the information divided by them.
+
+    Directions that the log does not show are left out.
+    """
     norm = np.sqrt(np.maximum(np.diag(information), 0.0))
     # Rounding over the norm of an unknown that the log does not show at all would be a shift of 1e130.
     norm[norm == 0] = 1.0
-    inverse = np.linalg.pinv(information / np.outer(norm, norm), rcond=_BLIND, hermitian=True)
-    return Shift(-inverse @ (gradient / norm) / norm, information)
+    eigenvalues, vectors = np.linalg.eigh(information / np.outer(norm, norm))
+    seen = eigenvalues > _BLIND * eigenvalues[-1]
+    return norm, eigenvalues[seen], vectors[:, seen]

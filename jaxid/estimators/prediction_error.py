@@ -14,7 +14,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from jaxid.errors import InputError
-from jaxid.estimators.command_noise import corrected_steps
+from jaxid.estimators.command_noise import Corrected, corrected_steps
 from jaxid.estimators.common.best_bodies import NEAREST, nearest_bodies
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.common.shapes import shape_starts
@@ -43,6 +43,8 @@ from jaxid.simulation.sensor_noise import force_noise
 _SCREENING = 12
 # Lags of the test of whiteness, and the probability at which it rejects.
 _LAGS, _REJECTS = 20, 1e-3
+# Widening of standard deviations by an uncertain correction from which on a note says so.
+_DOUBTFUL = 1.2
 
 
 def prediction_error(
@@ -143,19 +145,19 @@ def prediction_error_steps(
     fit, end = yield from _with_samples_at_rest(fit, lowest)
     end = replace(end, steps=screened + end.steps)
 
-    theta, reads = end.theta, [np.zeros(m.drives) for m in fit.members]
+    found = Corrected.not_at_all(end.theta, [m.drives for m in fit.members])
     if end.converged:
-        theta, reads = yield from corrected_steps(fit, end)
+        found = yield from corrected_steps(fit, end)
     if machine.parameters.bodies:
-        estimate = yield from _at_bodies(machine.parameters, fit, end, theta, reads)
+        estimate = yield from _at_bodies(machine.parameters, fit, end, found)
     else:
-        estimate = _estimate(fit, end, theta, reads)
+        estimate = _estimate(fit, end, found)
     if estimate.converged:
         estimate = yield from _with_bound_at_truth(estimate, fit, end.noises)
     if hessian:
         estimate = yield from _by_hessian(estimate, fit, end)
     if profile:
-        estimate = yield from _with_profiles(estimate, fit, end, theta, profile)
+        estimate = yield from _with_profiles(estimate, fit, end, found.theta, profile)
     return estimate
 
 
@@ -168,8 +170,7 @@ def _at_bodies(
     parameters: Parameters,
     fit: JointLikelihood,
     end: Maximum,
-    theta: np.ndarray,
-    reads: Sequence[np.ndarray],
+    plain: Corrected,
 ) -> Steps[Estimate]:
     """Return the estimate at the real bodies nearest to a fit without them.
 
@@ -177,19 +178,18 @@ def _at_bodies(
         parameters: The unknowns, with their bodies.
         fit: The likelihood without bodies.
         end: Its maximum.
-        theta: Estimates, (p,).
-        reads: Noise with which the command of each log was read, (m,).
+        plain: Estimates without bodies.
     """
+    theta = plain.theta
     jacobian, _, counts = stacked(_rows(fit, end, theta))
     if not (end.converged and np.all(np.isfinite(jacobian[counts])) and np.all(np.isfinite(theta))):
-        estimate = _estimate(fit, replace(end, converged=False), theta, reads)
+        estimate = _estimate(fit, replace(end, converged=False), plain)
     else:
-        plain = theta
-        theta, found = nearest_bodies(parameters, jacobian[counts], plain)
+        theta, found = nearest_bodies(parameters, jacobian[counts], plain.theta)
         # The innovations are those before the correction of the bias, as without bodies.
-        there = yield from fit.fit(end.theta + theta - plain, end.noises, 1)
+        there = yield from fit.fit(end.theta + theta - plain.theta, end.noises, 1)
         there = replace(there, converged=found, steps=end.steps + 1)
-        estimate = _estimate(fit, there, theta, reads)
+        estimate = _estimate(fit, there, replace(plain, theta=theta))
     machine = estimate.machine.with_plant(estimate.machine.plant, parameters.with_guess(theta.tolist()))
     return replace(estimate, machine=machine, notes=(*estimate.notes, NEAREST))
 
@@ -326,16 +326,15 @@ def _joined(
     return JointLikelihood(machine, tuple(members))
 
 
-def _estimate(fit: JointLikelihood, end: Maximum, theta: np.ndarray, reads: Sequence[np.ndarray]) -> Estimate:
+def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estimate:
     """Return the estimate of a fit, with its precision, its noise and a test of its innovations.
 
     Args:
         fit: The likelihood.
         end: Its maximum.
-        theta: Estimates, (p,).
-        reads: Noise with which the command of each log was read, (m,).
+        corrected: Estimates without the bias by noise of the commands.
     """
-    machine, several = fit.machine, len(fit.members) > 1
+    machine, several, theta = fit.machine, len(fit.members) > 1, corrected.theta
     rows = _rows(fit, end, theta)
     jacobian, z, counts = stacked(rows)
     finite = bool(np.all(np.isfinite(z[counts])) and np.all(np.isfinite(jacobian[counts])))
@@ -343,7 +342,7 @@ def _estimate(fit: JointLikelihood, end: Maximum, theta: np.ndarray, reads: Sequ
     widened = widening(plain, jacobian, z, counts, [len(row.residual) for row in rows]) if finite else 1.0
 
     entries: list[dict[str, Any]] = []
-    for member, row, noise, read in zip(fit.members, rows, end.noises, reads, strict=True):
+    for member, row, noise, read in zip(fit.members, rows, end.noises, corrected.reads, strict=True):
         shown, drives = np.exp(noise), member.drives
         of_readings = "velocity" if member.problem.kalman.of_velocity else "position"
         sizes = {"force": shown[:drives], "force_reading": read, of_readings: shown[drives:]}
@@ -371,11 +370,14 @@ def _estimate(fit: JointLikelihood, end: Maximum, theta: np.ndarray, reads: Sequ
         parts = [m.part for m in fit.members]
         details = by_log(parts, [s | entry for s, entry in zip(samples, entries, strict=True)])
     converged = end.converged and finite and bool(np.all(np.isfinite(theta)))
+    precision = plain.widened(np.broadcast_to(widened, len(theta)))
+    notes += _notes_of_correction(end, corrected, precision)
+    precision = precision.at_least(np.hypot(precision.std, corrected.doubt))
     return Estimate(
         method="prediction_error",
         machine=machine.with_estimate(theta),
         theta=theta,
-        precision=plain.widened(np.broadcast_to(widened, len(theta))),
+        precision=precision,
         converged=converged,
         message="converged" if converged else f"no convergence within {end.steps} steps",
         residual=np.where(counts, z, np.nan),
@@ -385,6 +387,32 @@ def _estimate(fit: JointLikelihood, end: Maximum, theta: np.ndarray, reads: Sequ
         notes=tuple(notes),
         details={**details, "log_likelihood": -end.cost},
     )
+
+
+def _notes_of_correction(end: Maximum, corrected: Corrected, precision: Precision) -> list[str]:
+    """Return notes about a correction for noise of the command that is large beside the precision.
+
+    Args:
+        end: The maximum before the correction.
+        corrected: Estimates after it.
+        precision: Their precision by the likelihood alone.
+    """
+    known = precision.identifiable & (precision.std > 0)
+    std = precision.std[known]
+    moved = np.max(np.abs(corrected.theta - end.theta)[known] / std, initial=0.0)
+    factor = np.max(np.hypot(std, corrected.doubt[known]) / std, initial=1.0)
+    notes = []
+    if moved > 1:
+        notes.append(
+            f"noise with which the command was read had moved a value by {moved:.2g} standard deviations: "
+            "this was corrected"
+        )
+    if factor > _DOUBTFUL:
+        notes.append(
+            "the correction for noise with which the command was read is uncertain: standard deviations are "
+            f"widened by up to {factor:.2g} for it"
+        )
+    return notes
 
 
 def _by_hessian(estimate: Estimate, fit: JointLikelihood, end: Maximum) -> Steps[Estimate]:
