@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float
 
 from jaxid.errors import InputError
@@ -36,13 +35,14 @@ from jaxid.numerics.lanes import Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, hessian_notes
 from jaxid.numerics.rows import Rows, assess_together
+from jaxid.numerics.whiteness import LAGS, band_of_half_the_power, whiteness
 from jaxid.simulation.replay import Numerics
 from jaxid.simulation.sensor_noise import force_noise
 
 # Evaluations that show which start is the best one.
 _SCREENING = 12
-# Lags of the test of whiteness, and the probability at which it rejects.
-_LAGS, _REJECTS = 20, 1e-3
+# Probability at which the test of whiteness rejects.
+_REJECTS = 1e-3
 # Widening of standard deviations by an uncertain correction from which on a note says so.
 _DOUBTFUL = 1.2
 
@@ -347,7 +347,7 @@ def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estim
         of_readings = "velocity" if member.problem.kalman.of_velocity else "position"
         sizes = {"force": shown[:drives], "force_reading": read, of_readings: shown[drives:]}
         p = [whiteness(e[c]) for e, c in zip(row.residual.T, row.counts.T, strict=True)]
-        entries.append({"noise": sizes, "whiteness": {"lags": _LAGS, "p": p}})
+        entries.append({"noise": sizes, "whiteness": {"lags": LAGS, "p": p}})
 
     each = " for each log," if several else ""
     notes = [f"noise of the force and of the readings was estimated{each} with the unknowns"]
@@ -360,8 +360,8 @@ def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estim
         )
     if min(min(entry["whiteness"]["p"]) for entry in entries) < _REJECTS:
         notes.append(
-            "the innovations are not white (rounding, coloured noise or an incomplete model): the standard "
-            "deviations are widened accordingly"
+            f"the innovations are not white{_bands(fit, rows)} (rounding, coloured noise or an incomplete "
+            "model): the standard deviations are widened accordingly"
         )
     details = dict(entries[0])
     if several:
@@ -387,6 +387,21 @@ def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estim
         notes=tuple(notes),
         details={**details, "log_likelihood": -end.cost},
     )
+
+
+def _bands(fit: JointLikelihood, rows: Sequence[Rows]) -> str:
+    """Return in words where half of the power of innovations lies that are not white; empty if anywhere."""
+    bands = [
+        band_of_half_the_power(np.where(c, e, 0.0), 1 / member.part.log.period)
+        for member, row in zip(fit.members, rows, strict=True)
+        for e, c in zip(row.residual.T, row.counts.T, strict=True)
+        if whiteness(e[c]) < _REJECTS
+    ]
+    found = [band for band in bands if band is not None]
+    if len(found) != 1:
+        return ""
+    low, high = found[0]
+    return f", and half of their power lies from {low:.2g} to {high:.2g} Hz"
 
 
 def _notes_of_correction(end: Maximum, corrected: Corrected, precision: Precision) -> list[str]:
@@ -459,19 +474,3 @@ def _precision(
     scale = np.where(theta != 0, theta, 1.0)
     precision = assess_together(fit.machine.parameters.names, rows, scale, hessian)
     return replace(precision, kind=FULL_HESSIAN if precision.kind == FULL_HESSIAN else FISHER)
-
-
-def whiteness(z: Float[np.ndarray, " time"], lags: int = _LAGS) -> float:
-    """Return the probability that white noise has autocorrelations as large as these.
-
-    Source:
-        Ljung & Box (1978), Biometrika 65, statistic of the first `lags` autocorrelations.
-    """
-    samples, z = len(z), z - z.mean()
-    lags = min(lags, samples // 5)
-    power = z @ z
-    if lags < 1 or power <= 0:
-        return 1.0
-    r = np.array([z[k:] @ z[:-k] for k in range(1, lags + 1)]) / power
-    statistic = samples * (samples + 2) * np.sum(r**2 / (samples - np.arange(1, lags + 1)))
-    return float(scipy.stats.chi2.sf(statistic, lags))

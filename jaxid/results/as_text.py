@@ -190,7 +190,9 @@ def _minimal(content: dict[str, Any]) -> list[str]:
 def discovery_table(result: Discovery) -> str:
     """Return the text that `discover` prints."""
     content = results.discovery_json(result)
-    lines = [f"verdict: {result.verdict}", *[f"finding: {finding}" for finding in result.findings]]
+    known = result.verdict != "nothing_missing" or result.model_complete is not None
+    hedge = "" if known else " (but whether anything is missing is not known)"
+    lines = [f"verdict: {result.verdict}{hedge}", *[f"finding: {finding}" for finding in result.findings]]
     # An effect says itself where it acts, better than a curve that knows no physics.
     if content["where"] and not result.effects:
         lines.append(f"where:   {content['where']['text']}")

@@ -223,7 +223,11 @@ def test_what_is_absent_is_left_out(data):
 
 
 def test_verdicts_are_in_plain_words():
-    assert "nothing is missing" in _words(render(_discovery(verdict="nothing_missing", views=())))
+    nothing = {"verdict": "nothing_missing", "effects": (), "views": ()}
+    assert "nothing is missing" in _words(render(_discovery(**nothing, model_complete=True)))
+    unknown = _words(render(_discovery(**nothing, model_complete=None)))
+    assert "nothing was found" in unknown
+    assert "nothing is missing" not in unknown
     assert "unexplained" in _words(render(_discovery(verdict="unexplained", views=())))
     words = _words(render(_identification()))
     assert "1 parameter identified" in words

@@ -56,8 +56,10 @@ def verdict_words(data: ReportData) -> str:
     if data.verdict == "found":
         found = f"found: {_named_effects(data)}"
         return found if data.explains else f"{found}; the log is not explained"
+    if data.verdict == "nothing_missing":
+        return "nothing is missing" if data.model_complete else "nothing was found"
     if data.verdict is not None:
-        return {"nothing_missing": "nothing is missing"}.get(data.verdict, data.verdict)
+        return data.verdict
     if data.converged is False:
         return "did not converge"
     if not data.explains:
@@ -80,6 +82,8 @@ def verdict_class(data: ReportData) -> str:
     if data.verdict == "unexplained" or data.model_complete is False or not data.identified:
         return "open"
     if data.verdict is None and not all(row.identifiable for row in data.parameters):
+        return "open"
+    if data.verdict == "nothing_missing" and not data.model_complete:
         return "open"
     return "good"
 
