@@ -145,14 +145,9 @@ def propose(session: Session, search: Search, named: cand.Candidate, rival: Scor
     playback = _playback(session, search, pair, experiment)
     shapes, starts = _family(session, limits, experiment)
 
-    # The motion of a rival with a value that ran away is not finite, whatever the signal, and XLA's code for
-    # its derivatives ended the process.
-    tried = playback.runs(pair, shapes.signal(starts[-1]))
-    finite = all(np.all(np.isfinite(run.position)) for run in tried)
-
     # Signals are optimised with smooth friction, and judged by simulation with exact friction.
     best, outcome, peaks = None, None, None
-    for p in _optimised(starts, experiment, ModelPair.of(rounded), shapes, limits) if finite else []:
+    for p in _optimised(starts, experiment, ModelPair.of(rounded), shapes, limits):
         fitting = kept_within(limits, shapes, p, lambda signal: playback.peaks(pair, signal))
         if fitting is None:
             continue
@@ -283,9 +278,7 @@ def _optimised(
         good = np.isfinite(value) & np.all(np.isfinite(slope))
         return (float(value), np.asarray(slope)) if good else (1e6, np.zeros_like(p))
 
-    # The gradient of several joints is computed forwards, which costs four times as much: see `loss`.
-    slower = 4 if experiment.start.size > 1 else 1
-    steps = slower * len(shapes.basis) * experiment.drive.substeps * experiment.start.size
+    steps = len(shapes.basis) * experiment.drive.substeps * experiment.start.size
     affordable = max(_STEPS // steps, _FEWEST)
 
     # The last start is the log's signal, if it has one: it keeps to its limits most reliably.

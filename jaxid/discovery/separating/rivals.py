@@ -278,8 +278,5 @@ def loss(
         value = -0.5 * jnp.sum(jnp.log(nats + 1e-3)) + cost
         return value, value
 
-    # Several joints are differentiated forwards, though it takes four times as long: with jaxlib 0.10, XLA's
-    # code for reverse mode through three masses, one with presliding, ends in a segmentation fault.
-    differentiate = jax.jacfwd if experiment.start.size > 1 else jax.grad
-    slope, value = differentiate(of, has_aux=True)(p)
+    slope, value = jax.grad(of, has_aux=True)(p)
     return value, slope
