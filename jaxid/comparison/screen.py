@@ -177,7 +177,7 @@ def screen_changes(
         fitted = model.fitted_in(k)
         fixed = [u.index for u in model.fixed if k in u.logs]
         e, jacobian = log.evaluate(model.theta[k], [*fitted, *fixed])
-        own, extra = [], np.zeros((*e.shape, 0))
+        own, extra = [], []
         if effects:
             own = log.points(rest, model.theta[k], e)
             scale = np.array([c.innovation for c in log.colour])

@@ -61,11 +61,12 @@ def start_points(
                 at[c.index] = c.probe(k)
             e, jacobian = evaluate(superset, data, at, np.concatenate([c.index for c in group]))
             for c in group:
+                # Nothing that is faint or neutral shifts the residual. The sum of all of them may: that of a
+                # spring does if a short stroke lies far from the origin.
                 shift, unscaled = np.zeros_like(e), None
-                if not group[0].amplitude.any():
+                if group is not faint:
                     joints = slice(None) if len(group) == 1 else slice(c.port, c.port + 1)
                     shift[:, joints] = (e - residual)[:, joints]
-                if group is not faint:
                     # At a neutral start, as of a gain, only the ratio keeps zeros from solving the balance.
                     scale = _changes_of_scale(superset, data, at, c.index)
                     unscaled = jacobian[..., c.index] + e[..., None] * scale

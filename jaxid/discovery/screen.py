@@ -240,8 +240,8 @@ def _guess(
 
 def all_columns(
     e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray, scale: np.ndarray
-) -> np.ndarray:
-    """Return columns of every candidate that might explain a residual.
+) -> list[np.ndarray]:
+    """Return the columns of every candidate that might explain a residual, by candidate.
 
     A candidate in the drive contributes those of its best start. Its columns hold the noise of the logged
     force: lags and delays of several lengths together are a filter that reproduces the noise of the residual.
@@ -250,26 +250,32 @@ def all_columns(
     in_drive = [p for p in points if not p.candidate.has_grid and not p.candidate.amplitude.any()]
     others = [p for p in points if not p.candidate.has_grid and p.candidate.amplitude.any()]
     none = np.zeros((*e.shape, 0))
-    columns = np.concatenate([none, *(p.explaining for p in others)], axis=2)
+    found = [
+        np.concatenate([p.explaining for p in starts], axis=2) for starts in _by_candidate(others).values()
+    ]
+    columns = np.concatenate([none, *found], axis=2)
 
-    chosen = []
-    by_candidate: dict[int, list[cand.Point]] = {}
-    for p in in_drive:
-        by_candidate.setdefault(id(p.candidate), []).append(p)
-    for starts in by_candidate.values():
+    for starts in _by_candidate(in_drive).values():
         gained = _gains(e, base, columns, starts, counts, scale) if len(starts) > 1 else np.zeros(1)
-        chosen.append(starts[int(np.argmax(gained))].explaining)
-    columns = np.concatenate([columns, *chosen], axis=2)
+        found.append(starts[int(np.argmax(gained))].explaining)
+    columns = np.concatenate([none, *found], axis=2)
 
     many = [p for p in points if p.candidate.has_grid]
     if not many:
-        return columns
+        return found
     gained = _gains(e, base, columns, many, counts, scale)
     best = int(np.argmax(gained))
     # The gain that the best of so many starts reaches by chance once in a thousand.
     chance = np.log(1000 * len(many)) + many[best].columns.shape[2]
-    clear = [many[best].columns] if gained[best] > chance else []
-    return np.concatenate([columns, *clear], axis=2)
+    return [*found, many[best].columns] if gained[best] > chance else found
+
+
+def _by_candidate(points: list[cand.Point]) -> dict[int, list[cand.Point]]:
+    """Return points by the identity of their candidate."""
+    found: dict[int, list[cand.Point]] = {}
+    for p in points:
+        found.setdefault(id(p.candidate), []).append(p)
+    return found
 
 
 def _gains(

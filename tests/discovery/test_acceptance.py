@@ -93,10 +93,37 @@ def test_whitener_leaves_what_candidates_would_explain(axis):
     slow = np.sin(np.linspace(0, 20, len(noise)))[:, None]
     base = np.ones((*noise.shape, 1))
     counts = search.samples.moving
-    whitener, _ = fit_whitener(noise + 5 * slow, base, slow[..., None], counts, search.colour)
-    alone, _ = fit_whitener(noise + 5 * slow, base, base, counts, search.colour)
+    whitener, _ = fit_whitener(noise + 5 * slow, base, [slow[..., None]], counts, search.colour)
+    alone, _ = fit_whitener(noise + 5 * slow, base, [base], counts, search.colour)
     kept = [np.sum(w(slow[..., None]) ** 2) for w in (whitener, alone)]
     assert kept[0] > 5 * kept[1]
+
+
+def test_columns_that_filter_the_noise_are_no_explanation(axis):
+    """Two columns of the noise itself took away its upper band, which then counted a hundredfold."""
+    _, search = axis
+    counts = search.samples.moving
+    noise = 0.2 * np.random.default_rng(2).standard_normal(counts.shape)
+    slow = np.sin(np.linspace(0, 20, len(noise)))[:, None, None]
+    steeper = np.gradient(np.gradient(noise, axis=0), axis=0)[..., None]
+    base = np.ones((*noise.shape, 1))
+    filters = np.concatenate([steeper, np.gradient(np.gradient(steeper, axis=0), axis=0)], axis=2)
+    whitener, drawn = fit_whitener(noise, base, [slow, filters], counts, search.colour)
+    for white in (whitener(noise[..., None])[:, 0], drawn):
+        assert white.std() == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_short_stroke_far_from_the_origin_shifts_no_residual(tmp_path):
+    """The faint springs there are loud together; their sum stood for the shift by each added force."""
+    setup = machines.emps_like(3, 1.0, 4.0)
+    t = np.arange(round(4.0 * setup.rate)) / setup.rate
+    loop = dataclasses.replace(setup.loop, reference=0.15 + 0.003 * np.sin(2 * np.pi * t))
+    _, search = start_search(opened(tmp_path, dataclasses.replace(setup, loop=loop)))
+    theta = fitted(search)
+    e, _ = search.domain.evaluate(search.samples, theta, search.active)
+    points = start_points(search.superset, search.rest(), search.samples, theta, e)
+    assert sum(p.candidate.amplitude.any() for p in points) > 10
+    assert all(not p.offset.any() for p in points if p.candidate.amplitude.any())
 
 
 def test_short_logs_have_shorter_stretches():
