@@ -442,6 +442,9 @@ class Search:
             for s, guess in zip(new, guesses, strict=True):
                 theta[s.candidate.index] = guess
             starts.append(theta)
+        returned = self._returned(starts[0])
+        if returned is not None:
+            starts.append(returned)
         theta = self.fit_from(starts, active)
 
         e, jacobian = self.domain.evaluate(self.samples, theta, active)
@@ -455,6 +458,22 @@ class Search:
         index = np.concatenate([s.candidate.index for s in new])
         reason = self.acceptance.objection(index, model.theta, theta, validation, confirmed, len(active))
         return replace(score, evidence=gained, validation=validation, theta=theta, reason=reason)
+
+    def _returned(self, theta: np.ndarray) -> np.ndarray | None:
+        """Return unknowns of the case that a model without an effect drove to zero to their guesses.
+
+        A missing spring makes the inertia vanish on a slow sine, and a fit does not return from zero.
+
+        Returns:
+            The unknowns; None if none has vanished.
+        """
+        base, guess = self.superset.base, self.superset.neutral[self.superset.base]
+        gone = np.abs(theta[base]) < _GONE * np.abs(guess)
+        if not gone.any():
+            return None
+        out = theta.copy()
+        out[base] = np.where(gone, guess, theta[base])
+        return out
 
     def drop_superfluous(
         self, model: Model, limit: float, effects: Sequence[cand.Candidate]

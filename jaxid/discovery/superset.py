@@ -58,6 +58,7 @@ def scales_of(
                 period=data.period,
                 duration=data.period * len(data.q),
                 between=0.0 if between is None else float(np.max(between[drive_columns])),
+                farthest=float(np.abs(y[:, port]).max()),
             )
         )
     return tuple(scales)

@@ -81,6 +81,7 @@ class Scales:
         duration: Length of the log [s].
         between: Largest absolute force between the rows of a log that is slower than its loop; zero if it is
             not known.
+        farthest: Largest distance from the origin of the position; zero: half the stroke.
     """
 
     position: float
@@ -92,6 +93,7 @@ class Scales:
     period: float
     duration: float
     between: float = 0.0
+    farthest: float = 0.0
 
     @property
     def largest_force(self) -> float:
@@ -110,6 +112,9 @@ class Scales:
         if "inertia" in dimension:
             base["inertia"] = self.force / self.acceleration
         over, _, under = dimension.partition("/")
+        # A spring acts by its distance from the origin, which may exceed a short stroke a hundred times.
+        if "position" in under and "time" not in over:
+            base["position"] = max(self.position, self.farthest)
         value = 1.0
         for words, sign in ((over, 1), (under, -1)):
             for word in words.split("*") if words not in ("", "1") else ():

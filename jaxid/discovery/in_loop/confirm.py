@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.search import Search
-from jaxid.gap import simulated
+from jaxid.gap import simulation_of_log
 from jaxid.machine import Machine
 from jaxid.session import OpenedLog, Session
 
@@ -47,7 +47,7 @@ def _distance(machine: Machine, runs: list[OpenedLog]) -> float:
     """
     means = []
     for r in runs:
-        gap = simulated(r.machine(machine), r.log)
+        gap = simulation_of_log(r.machine(machine), r.log)
         if gap is None:
             columns = np.array([1e3])
         else:
