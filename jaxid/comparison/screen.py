@@ -177,13 +177,13 @@ def screen_changes(
         fitted = model.fitted_in(k)
         fixed = [u.index for u in model.fixed if k in u.logs]
         e, jacobian = log.evaluate(model.theta[k], [*fitted, *fixed])
-        own, extra = [], []
+        own, extra, noisy = [], np.zeros((*e.shape, 0)), None
         if effects:
             own = log.points(rest, model.theta[k], e)
             scale = np.array([c.innovation for c in log.colour])
             own = [p for p in own if has_influence(p, log.counts, scale)]
-            extra = all_columns(e, jacobian[..., fitted], own, log.counts, scale)
-        whitener, noise = fit_whitener(e, jacobian[..., fitted], extra, log.counts, log.colour)
+            extra, noisy = all_columns(superset, e, jacobian[..., fitted], own, log.counts, scale)
+        whitener, noise = fit_whitener(e, jacobian[..., fitted], extra, log.counts, log.colour, noisy)
         flipped = ev.flipped(noise, ev.stretch(len(noise)), _SURROGATES, rng)
         draws = log.drawn_noise(model.theta[k], model.effects_in(k), _SURROGATES)
         drawn.append(draws is not None)

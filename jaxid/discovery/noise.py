@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -24,7 +22,7 @@ _ORDER = 30
 _POINTS = 1024
 # Number of refits of the noise colour after the fitted part is filled up; further refits change nothing.
 _FILLINGS = 2
-# The fillings leave the innovations above this part of those before, unless columns filter the noise.
+# The fillings are steady if they leave the innovations above this part of those before.
 _QUIETER = 0.9
 
 
@@ -81,9 +79,10 @@ def _folded(density: np.ndarray, step: int) -> np.ndarray:
 def fit_whitener(
     e: Float[np.ndarray, "kept n"],
     base: Float[np.ndarray, "kept n p"],
-    extra: Sequence[Float[np.ndarray, "kept n k"]],
+    extra: Float[np.ndarray, "kept n k"],
     counts: Bool[np.ndarray, "kept n"],
     colour: tuple[NoiseModel, ...],
+    noisy: Bool[np.ndarray, " k"] | None = None,
 ) -> tuple[Whitener, Float[np.ndarray, " row"]]:
     """Fit a whitener to the noise in a residual, and return that noise as whitened rows.
 
@@ -92,59 +91,43 @@ def fit_whitener(
     their span, most of it in a short log. The removed part is filled up with noise of unit variance once a
     first model of the colour is known, and the colour is fitted again.
 
-    Columns by noisy readings may be a filter of the noise itself, as those of a spring behind a loop that
-    answers to its encoder: then they take away a whole band of it, which looks quieter after each filling.
-    The columns of one such effect are left out.
+    Columns by derivatives of noisy readings may be a filter of the noise itself, in a loop that answers to
+    its encoder. They then take away a whole band of it, which looks quieter after each filling. If the
+    fillings are steady without these columns, they are left out.
 
     Args:
         e: Force residual of the model.
         base: Columns of the model.
-        extra: Columns of each effect that might be missing.
+        extra: Columns of effects that might be missing.
         counts: Mask of the samples that count.
         colour: Noise expected from the sensors, by joint.
+        noisy: Mask of the columns by derivatives of readings; None: there are none.
     """
-    every = list(extra)
-    first = _of_remainder(e, base, every, counts, colour)
-    whitener, noise = _filled_up(first, e, base, every, counts)
-    if not every or _innovation(whitener) > _QUIETER * _innovation(first):
+    whitener, noise, steady = _filled_up(e, base, extra, counts, colour)
+    if steady or noisy is None or not noisy.any():
         return whitener, noise
-
-    # The innovations fall if an effect is large too. They stop falling if columns of noise are left out.
-    rests = [every[:k] + every[k + 1 :] for k in range(len(every))]
-    starts = [_of_remainder(e, base, rest, counts, colour) for rest in rests]
-    loudest = int(np.argmax([_innovation(start) for start in starts]))
-    without, other = _filled_up(starts[loudest], e, base, rests[loudest], counts)
-    if _innovation(without) > _QUIETER * _innovation(starts[loudest]):
-        return without, other
-    return whitener, noise
-
-
-def _of_remainder(
-    e: np.ndarray, base: np.ndarray, extra: Sequence[np.ndarray], counts: np.ndarray, colour: tuple
-) -> Whitener:
-    """Return the whitener of what columns leave of a residual."""
-    scale = np.array([c.innovation for c in colour])
-    ready = [stacked(x, counts, scale) for x in (base, _joined(e, extra), e[..., None])]
-
-    remainder = np.zeros_like(e)
-    remainder.T[counts.T] = left_over(span(*ready[:2]), ready[2][:, 0])
-    return Whitener.of(remainder * scale, counts, colour)
+    # The innovations fall if another effect is large too, and without these columns as well.
+    without, other, steady = _filled_up(e, base, extra[..., ~noisy], counts, colour)
+    return (without, other) if steady else (whitener, noise)
 
 
 def _filled_up(
-    whitener: Whitener, e: np.ndarray, base: np.ndarray, extra: Sequence[np.ndarray], counts: np.ndarray
-) -> tuple[Whitener, Float[np.ndarray, " row"]]:
-    """Return the whitener after the fillings, and the noise as whitened rows."""
-    columns = _joined(e, extra)
+    e: np.ndarray, base: np.ndarray, extra: np.ndarray, counts: np.ndarray, colour: tuple[NoiseModel, ...]
+) -> tuple[Whitener, Float[np.ndarray, " row"], bool]:
+    """Return the whitener after the fillings, the noise as whitened rows, and if the fillings are steady."""
+    scale = np.array([c.innovation for c in colour])
+    ready = [stacked(x, counts, scale) for x in (base, extra, e[..., None])]
+
+    remainder = np.zeros_like(e)
+    remainder.T[counts.T] = left_over(span(*ready[:2]), ready[2][:, 0])
+    remainder *= scale
+    whitener = Whitener.of(remainder, counts, colour)
+    before = _innovation(whitener)
+
     for _ in range(_FILLINGS):
-        filled = whitener.placed(_filled(whitener, e, base, columns))
+        filled = whitener.placed(_filled(whitener, e, base, extra))
         whitener = whitener.then(Whitener.of(filled, counts))
-    return whitener, _filled(whitener, e, base, columns)
-
-
-def _joined(e: np.ndarray, extra: Sequence[np.ndarray]) -> Float[np.ndarray, "kept n k"]:
-    """Return columns of several effects as one array."""
-    return np.concatenate([np.zeros((*e.shape, 0)), *extra], axis=2)
+    return whitener, _filled(whitener, e, base, extra), _innovation(whitener) > _QUIETER * before
 
 
 def _innovation(whitener: Whitener) -> float:

@@ -87,8 +87,8 @@ def screen_candidates(search: Search, model: Model, *, ahead: bool = False) -> S
     points = search.domain.points(rest, search.samples, model.theta, e)
     points = [p for p in points if has_influence(p, counts, scale)]
 
-    extra = all_columns(e, base, points, counts, scale)
-    whitener, noise = fit_whitener(e, base, extra, counts, search.colour)
+    extra, noisy = all_columns(search.superset, e, base, points, counts, scale)
+    whitener, noise = fit_whitener(e, base, extra, counts, search.colour, noisy)
     out = Screen.of(whitener, e, base)
     white, columns = whitener(e[..., None]), whitener(base)
 
@@ -239,43 +239,46 @@ def _guess(
 
 
 def all_columns(
-    e: np.ndarray, base: np.ndarray, points: list[cand.Point], counts: np.ndarray, scale: np.ndarray
-) -> list[np.ndarray]:
-    """Return the columns of every candidate that might explain a residual, by candidate.
+    superset: cand.CandidateModel,
+    e: np.ndarray,
+    base: np.ndarray,
+    points: list[cand.Point],
+    counts: np.ndarray,
+    scale: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return columns of every candidate that might explain a residual, and which are those of added springs.
+
+    The force of a spring between a joint and its load follows from the derivatives of the readings.
 
     A candidate in the drive contributes those of its best start. Its columns hold the noise of the logged
     force: lags and delays of several lengths together are a filter that reproduces the noise of the residual.
     A candidate with many starts contributes only if its best start clearly explains.
     """
     in_drive = [p for p in points if not p.candidate.has_grid and not p.candidate.amplitude.any()]
-    others = [p for p in points if not p.candidate.has_grid and p.candidate.amplitude.any()]
+    chosen = [p for p in points if not p.candidate.has_grid and p.candidate.amplitude.any()]
     none = np.zeros((*e.shape, 0))
-    found = [
-        np.concatenate([p.explaining for p in starts], axis=2) for starts in _by_candidate(others).values()
-    ]
-    columns = np.concatenate([none, *found], axis=2)
+    columns = np.concatenate([none, *(p.explaining for p in chosen)], axis=2)
 
-    for starts in _by_candidate(in_drive).values():
+    by_candidate: dict[int, list[cand.Point]] = {}
+    for p in in_drive:
+        by_candidate.setdefault(id(p.candidate), []).append(p)
+    for starts in by_candidate.values():
         gained = _gains(e, base, columns, starts, counts, scale) if len(starts) > 1 else np.zeros(1)
-        found.append(starts[int(np.argmax(gained))].explaining)
-    columns = np.concatenate([none, *found], axis=2)
+        chosen.append(starts[int(np.argmax(gained))])
+    columns = np.concatenate([none, *(p.explaining for p in chosen)], axis=2)
 
     many = [p for p in points if p.candidate.has_grid]
-    if not many:
-        return found
-    gained = _gains(e, base, columns, many, counts, scale)
-    best = int(np.argmax(gained))
-    # The gain that the best of so many starts reaches by chance once in a thousand.
-    chance = np.log(1000 * len(many)) + many[best].columns.shape[2]
-    return [*found, many[best].columns] if gained[best] > chance else found
+    if many:
+        gained = _gains(e, base, columns, many, counts, scale)
+        best = int(np.argmax(gained))
+        # The gain that the best of so many starts reaches by chance once in a thousand.
+        chance = np.log(1000 * len(many)) + many[best].columns.shape[2]
+        if gained[best] > chance:
+            chosen.append(many[best])
+            columns = np.concatenate([columns, many[best].columns], axis=2)
 
-
-def _by_candidate(points: list[cand.Point]) -> dict[int, list[cand.Point]]:
-    """Return points by the identity of their candidate."""
-    found: dict[int, list[cand.Point]] = {}
-    for p in points:
-        found.setdefault(id(p.candidate), []).append(p)
-    return found
+    springs = [cand.effect_of(superset, p.candidate).adds_spring for p in chosen]
+    return columns, np.repeat(np.array(springs, bool), [p.columns.shape[2] for p in chosen])
 
 
 def _gains(

@@ -215,7 +215,7 @@ def _gains(
     """Compute the held-out evidence of a curve over each variable, and the threshold of noise [nats]."""
     hats = {name: _hat_functions(x, counts) for name, x in named.items()}
     every = np.concatenate(list(hats.values()), axis=1)
-    whitener, _ = fit_whitener(e[:, None], jacobian[:, None], [every[:, None]], counts[:, None], (colour,))
+    whitener, _ = fit_whitener(e[:, None], jacobian[:, None], every[:, None], counts[:, None], (colour,))
     blocks = whitener.blocks()
     base = _independent(whitener(jacobian[:, None]))
     white = whitener(e[:, None, None])

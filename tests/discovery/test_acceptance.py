@@ -93,8 +93,8 @@ def test_whitener_leaves_what_candidates_would_explain(axis):
     slow = np.sin(np.linspace(0, 20, len(noise)))[:, None]
     base = np.ones((*noise.shape, 1))
     counts = search.samples.moving
-    whitener, _ = fit_whitener(noise + 5 * slow, base, [slow[..., None]], counts, search.colour)
-    alone, _ = fit_whitener(noise + 5 * slow, base, [base], counts, search.colour)
+    whitener, _ = fit_whitener(noise + 5 * slow, base, slow[..., None], counts, search.colour)
+    alone, _ = fit_whitener(noise + 5 * slow, base, base, counts, search.colour)
     kept = [np.sum(w(slow[..., None]) ** 2) for w in (whitener, alone)]
     assert kept[0] > 5 * kept[1]
 
@@ -108,7 +108,8 @@ def test_columns_that_filter_the_noise_are_no_explanation(axis):
     steeper = np.gradient(np.gradient(noise, axis=0), axis=0)[..., None]
     base = np.ones((*noise.shape, 1))
     filters = np.concatenate([steeper, np.gradient(np.gradient(steeper, axis=0), axis=0)], axis=2)
-    whitener, drawn = fit_whitener(noise, base, [slow, filters], counts, search.colour)
+    columns, noisy = np.concatenate([slow, filters], axis=2), np.array([False, True, True])
+    whitener, drawn = fit_whitener(noise, base, columns, counts, search.colour, noisy)
     for white in (whitener(noise[..., None])[:, 0], drawn):
         assert white.std() == pytest.approx(1.0, abs=0.05)
 
