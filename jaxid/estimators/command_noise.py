@@ -17,7 +17,9 @@ from jaxid.estimators.joint_likelihood import (
     gradients_together,
     scored_at,
 )
+from jaxid.numerics.bounds import presses
 from jaxid.numerics.lanes import Steps
+from jaxid.numerics.precision import Precision
 
 # Pairs of simulated noise for the correction of the bias by noise of the command's reading.
 _PAIRS = 4
@@ -27,6 +29,8 @@ _BLIND = 1e-10
 _BENT = 0.1
 # A value this near to a bound, on the scale of the solver, rests there.
 _AT_BOUND = 1e-9
+# Widening of standard deviations by an uncertain correction from which on a note says so.
+_DOUBTFUL = 1.2
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,34 @@ class Corrected:
     theta: Float[np.ndarray, " p"]
     reads: list[np.ndarray]
     doubt: Float[np.ndarray, " p"]
+
+    def widened(self, precision: Precision) -> Precision:
+        """Return a precision by the likelihood, widened by what is not known of the correction."""
+        return precision.at_least(np.hypot(precision.std, self.doubt))
+
+    def notes(self, fitted: Float[np.ndarray, " p"], precision: Precision) -> list[str]:
+        """Return notes about a correction that is large or uncertain beside the precision.
+
+        Args:
+            fitted: Estimates before the correction, (p,).
+            precision: Precision by the likelihood.
+        """
+        known = precision.identifiable & (precision.std > 0)
+        std = precision.std[known]
+        moved = np.max(np.abs(self.theta - fitted)[known] / std, initial=0.0)
+        factor = np.max(self.widened(precision).std[known] / std, initial=1.0)
+        notes = []
+        if moved > 1:
+            notes.append(
+                "noise with which the command was read had moved a value by "
+                f"{moved:.2g} standard deviations: this was corrected"
+            )
+        if factor > _DOUBTFUL:
+            notes.append(
+                "the correction for noise with which the command was read is uncertain: standard deviations "
+                f"are widened by up to {factor:.2g} for it"
+            )
+        return notes
 
     @classmethod
     def not_at_all(cls, theta: Float[np.ndarray, " p"], drives: Sequence[int]) -> Corrected:
@@ -202,7 +234,7 @@ def _pressed(fit: JointLikelihood, end: Maximum) -> Float[np.ndarray, " q"]:
     for place, scored in zip(fit.places, end.scored, strict=True):
         gradient[place] += scored.gradient
     lower, upper = fit.bounds
-    rests = ((end.x <= lower + _AT_BOUND) & (gradient > 0)) | ((end.x >= upper - _AT_BOUND) & (gradient < 0))
+    rests = presses(end.x, gradient, lower + _AT_BOUND, upper - _AT_BOUND)
     rests[fit.unknowns :] = False
     return np.where(rests, gradient, 0.0)
 

@@ -43,8 +43,6 @@ from jaxid.simulation.sensor_noise import force_noise
 _SCREENING = 12
 # Probability at which the test of whiteness rejects.
 _REJECTS = 1e-3
-# Widening of standard deviations by an uncertain correction from which on a note says so.
-_DOUBTFUL = 1.2
 
 
 def prediction_error(
@@ -155,7 +153,7 @@ def prediction_error_steps(
     if estimate.converged:
         estimate = yield from _with_bound_at_truth(estimate, fit, end.noises)
     if hessian:
-        estimate = yield from _by_hessian(estimate, fit, end)
+        estimate = yield from _by_hessian(estimate, fit, end, found)
     if profile:
         estimate = yield from _with_profiles(estimate, fit, end, found.theta, profile)
     return estimate
@@ -371,17 +369,17 @@ def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estim
         details = by_log(parts, [s | entry for s, entry in zip(samples, entries, strict=True)])
     converged = end.converged and finite and bool(np.all(np.isfinite(theta)))
     precision = plain.widened(np.broadcast_to(widened, len(theta)))
-    notes += _notes_of_correction(end, corrected, precision)
-    precision = precision.at_least(np.hypot(precision.std, corrected.doubt))
+    notes += corrected.notes(end.theta, precision)
+    beside = std_under_misspecification(jacobian, z, counts) if finite else None
     return Estimate(
         method="prediction_error",
         machine=machine.with_estimate(theta),
         theta=theta,
-        precision=precision,
+        precision=corrected.widened(precision),
         converged=converged,
         message="converged" if converged else f"no convergence within {end.steps} steps",
         residual=np.where(counts, z, np.nan),
-        std_misspecified=std_under_misspecification(jacobian, z, counts) if finite else None,
+        std_misspecified=None if beside is None else np.hypot(beside, corrected.doubt),
         samples=int(counts.sum()),
         steps=end.steps,
         notes=tuple(notes),
@@ -404,39 +402,16 @@ def _bands(fit: JointLikelihood, rows: Sequence[Rows]) -> str:
     return f", and half of their power lies from {low:.2g} to {high:.2g} Hz"
 
 
-def _notes_of_correction(end: Maximum, corrected: Corrected, precision: Precision) -> list[str]:
-    """Return notes about a correction for noise of the command that is large beside the precision.
-
-    Args:
-        end: The maximum before the correction.
-        corrected: Estimates after it.
-        precision: Their precision by the likelihood alone.
-    """
-    known = precision.identifiable & (precision.std > 0)
-    std = precision.std[known]
-    moved = np.max(np.abs(corrected.theta - end.theta)[known] / std, initial=0.0)
-    factor = np.max(np.hypot(std, corrected.doubt[known]) / std, initial=1.0)
-    notes = []
-    if moved > 1:
-        notes.append(
-            f"noise with which the command was read had moved a value by {moved:.2g} standard deviations: "
-            "this was corrected"
-        )
-    if factor > _DOUBTFUL:
-        notes.append(
-            "the correction for noise with which the command was read is uncertain: standard deviations are "
-            f"widened by up to {factor:.2g} for it"
-        )
-    return notes
-
-
-def _by_hessian(estimate: Estimate, fit: JointLikelihood, end: Maximum) -> Steps[Estimate]:
+def _by_hessian(
+    estimate: Estimate, fit: JointLikelihood, end: Maximum, corrected: Corrected
+) -> Steps[Estimate]:
     """Replace Fisher's information in the covariance by the full Hessian, if that is positive definite.
 
     Args:
         estimate: Estimate with its precision by Fisher's information.
         fit: The likelihood of one log.
         end: Its maximum.
+        corrected: Estimates without the bias by noise of the command.
     """
     [member], [scored] = fit.members, end.scored
     full = yield from hessian_steps(member.problem, scored)
@@ -446,7 +421,7 @@ def _by_hessian(estimate: Estimate, fit: JointLikelihood, end: Maximum) -> Steps
         rows = _rows(fit, end, estimate.theta)
         # Errors that outlast their colour's model widen both by the same factors.
         plain, curved = (_precision(fit, rows, estimate.theta, h) for h in (None, full))
-        precision = curved.widened(widening(plain, *stacked(rows)))
+        precision = corrected.widened(curved.widened(widening(plain, *stacked(rows))))
     notes = hessian_notes(precision, True, FISHER)
     return replace(estimate, precision=precision, notes=(*estimate.notes, *notes))
 

@@ -187,12 +187,17 @@ def _minimal(content: dict[str, Any]) -> list[str]:
     return ["", aligned(rows), *lines]
 
 
+def verdict_line(verdict: str, complete: bool | None) -> str:
+    """Return the line with the verdict of a search, and whether it is sure that nothing is missing."""
+    sure = verdict != "nothing_missing" or complete is not None
+    return f"verdict: {verdict}" + ("" if sure else " (but whether anything is missing is not known)")
+
+
 def discovery_table(result: Discovery) -> str:
     """Return the text that `discover` prints."""
     content = results.discovery_json(result)
-    known = result.verdict != "nothing_missing" or result.model_complete is not None
-    hedge = "" if known else " (but whether anything is missing is not known)"
-    lines = [f"verdict: {result.verdict}{hedge}", *[f"finding: {finding}" for finding in result.findings]]
+    verdict = verdict_line(result.verdict, result.model_complete)
+    lines = [verdict, *[f"finding: {finding}" for finding in result.findings]]
     # An effect says itself where it acts, better than a curve that knows no physics.
     if content["where"] and not result.effects:
         lines.append(f"where:   {content['where']['text']}")

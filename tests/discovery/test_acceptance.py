@@ -100,7 +100,7 @@ def test_whitener_leaves_what_candidates_would_explain(axis):
 
 
 def test_columns_that_filter_the_noise_are_no_explanation(axis):
-    """Two columns of the noise itself took away its upper band, which then counted a hundredfold."""
+    """Two columns of the noise itself took away its upper band, so that the noise was whitened wrongly."""
     _, search = axis
     counts = search.samples.moving
     noise = 0.2 * np.random.default_rng(2).standard_normal(counts.shape)

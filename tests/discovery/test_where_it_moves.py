@@ -13,11 +13,12 @@ from truth.axis.hidden_effects import COULOMB, SEARCH_CASES, VISCOUS
 
 
 def near(origin: float, t: np.ndarray) -> np.ndarray:
-    """Strokes of some centimetres."""
+    """Return strokes of some centimetres."""
     return origin + 0.02 * np.sin(2 * np.pi * 0.7 * t) + 0.008 * np.sin(2 * np.pi * 2.1 * t)
 
 
 def slow(_: float, t: np.ndarray) -> np.ndarray:
+    """Return a sine of which friction and a spring hide the inertia."""
     return 0.1 * np.sin(2 * np.pi * 0.08 * t)
 
 
@@ -45,7 +46,7 @@ def test_a_complete_model_far_from_the_origin_lacks_nothing(origin, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", ["quadratic_drag", "asymmetric_viscous", "stribeck_friction", "cogging"])
 def test_an_effect_far_from_the_origin_is_found_alone(hidden, tmp_path):
-    """Four others were named beside it; the ripple was taken out, because of the jerk of the first sample."""
+    """A cubic stiffness was named beside it; the ripple was taken out, because the log begins with a jerk."""
     found = searched(tmp_path, near, 3.0, hidden)
     assert (found.kinds, found.model_complete) == ([hidden], True)
 

@@ -48,7 +48,7 @@ def test_a_value_leaves_its_bound_if_only_the_noise_pressed_it_there():
 
 
 def fit_of_a_plain_simulation(log) -> np.ndarray:
-    """First moment, inertia, viscous and Coulomb friction and constant force of a pendulum that is driven."""
+    """Fit first moment, inertia, viscous and Coulomb friction and constant force of a driven pendulum."""
     t, q, torque = (np.asarray(log[name]) for name in ("time", "position", "torque"))
     steps, parts = np.diff(t), 10
 
@@ -81,6 +81,7 @@ def test_a_value_at_its_bound_does_not_move_the_others_of_a_measured_pendulum():
     z = (np.asarray(result.estimate.theta) - plain) / np.asarray(result.estimate.std)
     assert np.max(np.abs(z)) < 2.5
     assert result.gaps[0].simulation.rms[0] < 0.4
+    assert any("had moved a value by" in note for note in result.estimate.notes)
 
 
 def likelihood(folder, machine: str):
@@ -114,6 +115,9 @@ def test_what_a_correction_leaves_open_widens_the_standard_deviations(tmp_path):
     z = [(v - true[n]) / s for n, v, s in zip(fit.names, fit.theta, fit.std, strict=True)]
     assert np.max(np.abs(z)) < 2
     assert any("widened by up to 3.9 for it" in note for note in fit.notes)
+    curved = jaxid.identify(path, log, method="prediction_error", hessian=True).estimate
+    assert np.all(curved.std > 0.5 * fit.std)
+    assert np.all(fit.std_misspecified > 0.5 * fit.std)
 
 
 @pytest.mark.parametrize(("machine", "least"), [("axis", 4), ("flexible_axis", 8)])

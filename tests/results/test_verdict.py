@@ -15,6 +15,7 @@ from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.gap import force_gap, gaps
 from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.numerics.precision import Precision
+from jaxid.results.as_text import verdict_line
 from jaxid.results.verdict import judge
 from jaxid.results.verdict.absurd import remarks_on
 from jaxid.results.verdict.completeness import (
@@ -334,3 +335,13 @@ def test_spread_over_motions_of_a_model_without_drag(tmp_path):
     spread = np.std(theta, ddof=1)
     assert np.sqrt(np.mean(np.square(plain))) < 0.4 * spread
     assert 0.7 < np.sqrt(np.mean(np.square(beside))) / spread < 1.3
+
+
+@pytest.mark.parametrize(
+    ("verdict", "complete", "hedged"),
+    [("nothing_missing", None, True), ("nothing_missing", True, False), ("found", None, False)],
+)
+def test_the_terminal_says_if_nothing_is_known_to_be_missing(verdict, complete, hedged):
+    line = verdict_line(verdict, complete)
+    assert line.startswith(f"verdict: {verdict}")
+    assert line.endswith("is not known)") == hedged

@@ -20,6 +20,7 @@ from jaxid.discovery import candidates as cand
 from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.estimators.simulated_output import output_residual
 from jaxid.model.plant import Plant
+from jaxid.numerics.bounds import presses
 from jaxid.numerics.kept import kept_jit
 from jaxid.simulation.replay import Replay
 
@@ -168,7 +169,7 @@ def _step(
     out = np.zeros_like(x)
     for k in np.flatnonzero(going):
         gradient = jacobian[k].T @ e[k]
-        free = ~((x[k] <= lower) & (gradient > 0) | (x[k] >= upper) & (gradient < 0))
+        free = ~presses(x[k], gradient, lower, upper)
         columns = jacobian[k][:, free]
         with np.errstate(over="ignore"):  # a column that diverged takes no step
             size = np.linalg.norm(columns, axis=0)

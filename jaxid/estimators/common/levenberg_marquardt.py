@@ -18,6 +18,7 @@ from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky
 from jaxid.arrays import Array, library
 from jaxid.estimators.common.interior import inner_start
 from jaxid.model.unknowns import Parameters
+from jaxid.numerics.bounds import presses
 
 # Damping at the start, relative to the diagonal of the normal matrix.
 DAMPING = 1e-4
@@ -495,7 +496,7 @@ def advanced_by_model(
     nothing = jnp.where(first, _NOTHING * jnp.sqrt(2.0 * model[0]), p.nothing)
     # Checked at every step: a velocity has no effect while its friction level is zero, and one later.
     moves = moves & (p.scale * jnp.sqrt(jnp.diag(normal)) > nothing)
-    pressed = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+    pressed = presses(x, gradient, lower, upper)
     aim = x + _step(gradient, normal, damping, moves & ~pressed)
     trial = jnp.clip(aim, lower, upper)
     # The prediction is for the actual step, which a bound may shorten.
@@ -533,7 +534,7 @@ def _at_minimum(p: Progress, size: int, bounds: tuple[Array, Array], moves: Bool
     """
     lower, upper = bounds
     moves = moves & (p.scale * jnp.sqrt(jnp.diag(p.normal)) > p.nothing)
-    pressed = ((p.x <= lower) & (p.gradient > 0)) | ((p.x >= upper) & (p.gradient < 0))
+    pressed = presses(p.x, p.gradient, lower, upper)
     change = _step(p.gradient, p.normal, jnp.asarray(0.0), moves & ~pressed)
     fall = -change @ p.gradient - 0.5 * change @ p.normal @ change
     return jnp.isfinite(p.cost) & (fall >= 0) & (fall <= _SURE / size * p.cost)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array, library
+from jaxid.numerics.bounds import presses
 
 # The fit has converged if the log-likelihood can rise by no more than this [nats]: about a hundredth of a
 # standard deviation.
@@ -166,7 +167,7 @@ def _next_trial(
 ) -> tuple[Array, Array, Array]:
     """Return the damped step's end within the bounds, the fall that it predicts, and if a bound cut it."""
     # An unknown that presses against a bound rests.
-    rests = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+    rests = presses(x, gradient, lower, upper)
     size = jnp.sqrt(jnp.maximum(jnp.diag(normal), 1e-300))
     scaled = jnp.where(rests[:, None] | rests[None, :], 0.0, normal / jnp.outer(size, size))
     scaled = scaled + jnp.diag(jnp.where(rests, 1.0, damping + 1e-14))

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxid.numerics.bounds import presses
 from jaxid.numerics.lanes import Steps
 
 # Damping at the start, and beyond which a descent is stuck, relative to the diagonal of the normal matrix.
@@ -93,7 +94,7 @@ def descent_steps(
         return Descent(x, best, True, steps)
 
     while steps < max_steps:
-        pressed = ((x <= lower) & (best.gradient > 0)) | ((x >= upper) & (best.gradient < 0))
+        pressed = presses(x, best.gradient, lower, upper)
         aim = x + _step(best, damping, active & ~pressed)
         trial = np.clip(aim, lower, upper)
         change = trial - x
