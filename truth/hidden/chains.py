@@ -18,7 +18,7 @@ from truth.axis.stepper import Loop, Sensor
 from truth.chain import stepper as chain
 
 NOISES = (0.3, 1.0, 3.0)
-FIRST_SEED = {"calibrate": 3000, "test": 4001, "fresh": 5001, "last": 7001, "new": 9001}
+FIRST_SEED = {"calibrate": 3000, "test": 4001, "fresh": 5001, "last": 7001, "new": 9001, "latest": 10_001}
 KINDS = (
     "coulomb_friction", "quadratic_drag", "constant_force", "stribeck_friction", "cogging",
     "quadratic_stiffness", "cubic_stiffness",
