@@ -15,7 +15,7 @@ from truth.axis.machines import Setup
 from truth.hidden.machines import COARSE, SCALES, Scale, coarse_setup
 
 NOISES = (0.3, 1.0, 3.0)
-# All but "calibrate", "new" and "latest" were test splits once: faults that they showed have been repaired since.
+# Splits but "calibrate", "new" and "latest" were test splits once; faults that they showed were repaired.
 FIRST_SEED = {
     "calibrate": 1000,
     "seen": 2000,
