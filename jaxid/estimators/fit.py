@@ -109,8 +109,8 @@ def fit(
         hold: Course of the command between samples: "zero_order" or "linear".
         substeps: Integration steps per sample.
         sticks: Whether dry friction sticks exactly; else its sign is smoothed by the plant's `sharpness`.
-        solver: One of `jaxid.simulation.solvers.SOLVERS` in place of fixed steps; smooths dry friction.
-        minimiser: One of `jaxid.estimators.common.minimisers.MINIMISERS`, or a solver of optimistix.
+        solver: One of `jaxid.names.SOLVERS` in place of fixed steps; smooths dry friction.
+        minimiser: One of `jaxid.names.MINIMISERS`, or a solver of optimistix.
 
     Returns:
         The estimates, their covariance and the residual.

@@ -74,7 +74,7 @@ def test_lugre_at_a_steady_velocity_is_the_stribeck_curve():
 
 @pytest.mark.parametrize(("q", "v", "u"), MOTIONS)
 def test_drive_ripple_is_its_formula(q, v, u):
-    action = made("drive_ripple", part=0.1, period=0.02, phase=0.7).act(signals(q, v, u), None)
+    action = made("drive_ripple", depth=0.1, period=0.02, phase=0.7).act(signals(q, v, u), None)
     expected = u * (1 + 0.1 * math.cos(2 * math.pi * q / 0.02 + 0.7))
     assert float(action.drive) == pytest.approx(expected, rel=1e-14)
     assert float(jnp.asarray(action.force)) == 0.0
