@@ -33,6 +33,8 @@ _DITHERS = 0.5
 _SMOOTH, _REST = 21, 500
 # Samples beside one at rest that count as slow too.
 _AROUND = 3
+# Standard deviations from zero beyond which the sign of a velocity is known.
+_SIGN_KNOWN = 3.0
 
 
 class KalmanFilter(eqx.Module):
@@ -102,8 +104,10 @@ class KalmanFilter(eqx.Module):
             errors = size + jnp.arange(m)
             p = p.at[errors, errors].set((drive.gain * self.offset) ** 2)
 
-        def tick(carry: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-            x, p = carry
+        def tick(
+            carry: tuple[Array, Array, Array], now: tuple
+        ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array]]:
+            x, p, last = carry
             u0, u1, t, reading, used, jolt = now
 
             innovations, variances = [], []
@@ -123,15 +127,23 @@ class KalmanFilter(eqx.Module):
                 new = new if self.offset is None else jnp.concatenate([new, error])
                 return new, new
 
+            known = x[speeds] ** 2 > _SIGN_KNOWN**2 * p[speeds, speeds]
             jacobian, x = jax.jacfwd(step, has_aux=True)(jnp.concatenate([x, jnp.zeros(m)]))
             a, b = jacobian[:, :whole], jacobian[:, whole:]
+
+            # A step in which dry friction stops a joint has no slope by its velocity. If the sign of the
+            # velocity is not known, the joint may as well move on: its slope is then not below that of the
+            # last step with a known sign, or the filter would be surer after the step than it can be.
+            slope = a[speeds, speeds]
+            slope = jnp.where(known, slope, jnp.maximum(slope, last))
+            a = a.at[speeds, speeds].set(slope)
             p = a @ p @ a.T + (b * force_variance) @ b.T
             p = p.at[speeds, speeds].add(jolt) if jolt.ndim == 1 else p.at[n : 2 * n, n : 2 * n].add(jolt)
-            return (x, 0.5 * (p + p.T)), (jnp.stack(innovations), jnp.stack(variances))
+            return (x, 0.5 * (p + p.T), slope), (jnp.stack(innovations), jnp.stack(variances))
 
         times = drive.period * jnp.arange(self.command.shape[0])
         inputs = (before, after, times, self.readings, self.used, jolts)
-        out = jax.lax.scan(tick, (x, p), inputs)[1]
+        out = jax.lax.scan(tick, (x, p, jnp.zeros(n)), inputs)[1]
         return out[0][:: self.every], out[1][:: self.every]
 
     def _jolts(self, plant: Plant) -> Array:
