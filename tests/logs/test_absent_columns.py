@@ -52,7 +52,9 @@ def velocity_log(seed, seconds=6.0, noise=0.1):
     return Log(time=t, position=None, velocity=measured, force=run["force"])
 
 
-@pytest.mark.parametrize("method", ["prediction_error", "inverse_dynamics", "output_error"])
+@pytest.mark.parametrize(
+    "method", ["prediction_error", "inverse_dynamics", pytest.param("output_error", marks=pytest.mark.slow)]
+)
 def test_a_log_of_velocities_gives_the_parameters(method):
     estimates = identify_many(case_of(SPEEDS), [velocity_log(seed) for seed in range(6)], method=method)
     z = np.array([(e.theta - [0.02, 0.12, 0.25]) / e.std for e in estimates])
@@ -181,7 +183,7 @@ def swing(seed, noise=1e-4, step=0.0, seconds=6.0):
     return {"t": run["t"], "q": run["position"]}
 
 
-@pytest.mark.parametrize("sensor", [{}, {"noise": 0.0, "step": 2e-4}])
+@pytest.mark.parametrize("sensor", [pytest.param({}, marks=pytest.mark.slow), {"noise": 0.0, "step": 2e-4}])
 def test_a_free_swing_on_a_known_spring(sensor):
     case = case_of(SWUNG, [*FRICTION, SPRING])
     estimates = identify_many(case, [swing(seed, **sensor) for seed in range(8)])
