@@ -15,8 +15,8 @@ from truth.axis import machines
 from truth.axis.cases import case_text, write_case
 from truth.axis.hidden_effects import AT_REST, COULOMB, PAIRS, SEARCH_CASES, VISCOUS, SearchCase
 
-# Quick too: cogging in the notebook of the first tour, Coulomb friction at a steady table.
-FAST = ("static_friction", "input_delay", "hysteresis")
+# Cogging is searched for by the notebook of the first tour, with the quick tests too.
+FAST = ("coulomb_friction", "static_friction", "input_delay", "hysteresis")
 
 
 def kinds_to_test():
