@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 import jaxid
+from benchmarks.hidden_run import logged
+from truth.axis.cases import write_case
 from truth.axis.machines import moves
 from truth.axis.stepper import Loop, Machine, Sensor, simulate
+from truth.hidden.bench import text_of
+from truth.hidden.cases import HiddenCase
 
 # A lift of 60 kg, half of its weight balanced; its current is logged, 120 N/A.
 GAIN = 120.0
@@ -49,6 +53,18 @@ def test_a_break_away_friction_stays_one():
     d = found(static_friction={"level": 25.0})
     assert d.kinds == ["static_friction"]
     assert d.parameters["static_friction.level"].value == pytest.approx(25.0, rel=0.15)
+
+
+@pytest.mark.slow
+def test_a_break_away_friction_that_a_fading_one_imitates_stays_one(tmp_path):
+    """A servo with little noise: the fading friction gains 734 nats, the true one more."""
+    case = HiddenCase(
+        "effects", "static_friction", "servo", 0.3, 18021, hidden=("static_friction",), validated=False
+    )
+    d = jaxid.discover(write_case(tmp_path, text_of(case)), logged(case), refit=False)
+    assert d.kinds == ["static_friction"]
+    value = d.parameters["static_friction.level"]
+    assert abs(value.value - case.truth["static_friction.level"]) < 3 * value.std
 
 
 @pytest.mark.slow
