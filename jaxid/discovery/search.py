@@ -379,7 +379,8 @@ class Search:
                 self.model = Model(added, self.fit(best.refitted, self.fitted_by(added)))
                 steps.append(self.step(self.model, added=best, dropped=named, scores=scores, threshold=limit))
             elif best.candidate is not named:
-                ties = (best, *ties) if self._equal(current, best) else ()
+                # One that gains more with more parameters does not replace the effect, but is a rival of it.
+                ties = tuple(s for s in good if self._equal(s, current))
             out[k] = tuple(s for s in ties if s.candidate is not self.model.added[k])
         return out
 
