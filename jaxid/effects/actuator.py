@@ -188,6 +188,11 @@ class Saturation(Effect):
             limits += [*np.geomspace(1.2 * scales.peak_force, 0.97 * scales.largest_force, 5)]
         return [{"limit": float(limit)} for limit in limits]
 
+    @classmethod
+    def finer_starts(cls, scales: Scales) -> list[dict[str, float]]:
+        # A drive that is at its limit for much of the log: only starts near the limit are better than none.
+        return [{"limit": float(limit)} for limit in scales.peak_force * np.geomspace(0.05, 0.9, 20)]
+
 
 @register("voltage_limit")
 class VoltageLimit(Effect):

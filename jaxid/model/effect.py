@@ -242,7 +242,8 @@ class Effect(eqx.Module):
     def finer_starts(cls, scales: Scales) -> list[dict[str, float]]:
         """Return further values from which a search starts where nothing else explains the log.
 
-        They are for shapes so many that every search would pay for them (a ripple of hundreds of periods).
+        They are for so many starts that every search would pay for them (a ripple of hundreds of periods, a
+        limit that holds for much of a log).
         A search in simulated loops does not use them.
         """
         return []
