@@ -180,7 +180,7 @@ class _Trial:
         drive = Drive(np.asarray(machine.gain), self.log.period, self.log.hold, finer * self.steps, True)
         plant = machine.plant
         for joint in self.joints:
-            plant = plant.with_effect(StaticFriction(level=as_array(0.0), port=joint))
+            plant = with_break_away(plant, 0.0, joint)
         prior = _prior(self.estimate)
         places, theta = machine.parameters.places, np.asarray(self.estimate.theta)
 
@@ -202,6 +202,11 @@ class _Trial:
         ends = coarse[max(best - 1, 0)], coarse[min(best + 1, _LEVELS - 1)]
         fine = np.linspace(*ends, _LEVELS + 2)[1:-1]
         return np.concatenate([coarse, fine]), [*fits, *at(fine)]
+
+
+def with_break_away(plant: Plant, level: float, joint: int) -> Plant:
+    """Return a plant with a break-away friction of a level [N or N m] at a joint."""
+    return plant.with_effect(StaticFriction(level=as_array(level), port=joint))
 
 
 def _lost_in_noise(peak: float, unit: str) -> str:

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.at_rest.break_away import BreakAway
-from jaxid.effects.friction import StaticFriction
+from jaxid.discovery.at_rest.break_away import BreakAway, with_break_away
 from jaxid.estimators.choice import choose_method
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.prediction_error import prediction_error
 from jaxid.machine import Machine
-from jaxid.model.parameter import as_array
 from jaxid.model.unknowns import free_effect
 from jaxid.session import Session
 from jaxid.simulation.sensor_noise import force_noise
@@ -101,7 +99,7 @@ def fading_friction(
 
 def _gain_of_break_away(session: Session, without: Estimate, level: float, port: int) -> float:
     """Return the gain in log-likelihood by a break-away friction of a known level [nats]."""
-    plant = without.machine.plant.with_effect(StaticFriction(level=as_array(level), port=port))
+    plant = with_break_away(without.machine.plant, level, port)
     fit = _fitted(session, without.machine.with_plant(plant, without.machine.parameters), without.theta)
     return _gain(fit, without)
 
