@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 
 import jaxid
-from benchmarks.hidden_run import logged
-from truth.axis.cases import write_case
+from tests.support.hidden_effect import search_hidden
 from truth.axis.machines import moves
 from truth.axis.stepper import Loop, Machine, Sensor, simulate
-from truth.hidden.bench import text_of
-from truth.hidden.cases import HiddenCase
 
 # A lift of 60 kg, half of its weight balanced; its current is logged, 120 N/A.
 GAIN = 120.0
@@ -58,13 +55,10 @@ def test_a_break_away_friction_stays_one():
 @pytest.mark.slow
 def test_a_break_away_friction_that_a_fading_one_imitates_stays_one(tmp_path):
     """A servo with little noise: the fading friction gains 734 nats, the true one more."""
-    case = HiddenCase(
-        "effects", "static_friction", "servo", 0.3, 18021, hidden=("static_friction",), validated=False
-    )
-    d = jaxid.discover(write_case(tmp_path, text_of(case)), logged(case), refit=False)
+    d, truth = search_hidden(tmp_path, "static_friction", "servo", 0.3, 18021)
     assert d.kinds == ["static_friction"]
     value = d.parameters["static_friction.level"]
-    assert abs(value.value - case.truth["static_friction.level"]) < 3 * value.std
+    assert abs(value.value - truth["static_friction.level"]) < 3 * value.std
 
 
 @pytest.mark.slow

@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 
 import jaxid
-from benchmarks.hidden_run import logged
 from jaxid.discovery.superset import build_candidate_model
 from jaxid.session import open_session
 from tests.support.axis_log import log_of
+from tests.support.hidden_effect import search_hidden
 from truth.axis import machines
 from truth.axis.cases import case_text, write_case
-from truth.hidden.bench import text_of
-from truth.hidden.cases import HiddenCase
 
 
 def test_finer_starts_follow_the_others(tmp_path):
@@ -51,11 +49,8 @@ def test_a_fine_ripple_is_named_with_its_period(preset, motion, turns, tmp_path)
 @pytest.mark.slow
 def test_a_limit_that_holds_for_much_of_a_log_is_named_with_its_value(tmp_path):
     """Of the first starts those beside this limit leave a larger residual than no limit."""
-    case = HiddenCase(
-        "effects", "saturation", "heavy_slide", 0.3, 18159, hidden=("saturation",), validated=False
-    )
-    found = jaxid.discover(write_case(tmp_path, text_of(case)), logged(case), refit=False)
+    found, truth = search_hidden(tmp_path, "saturation", "heavy_slide", 0.3, 18159)
     assert found.kinds == ["saturation"]
     limit = found.parameters["saturation.limit"]
-    assert abs(limit.value - case.truth["saturation.limit"]) < 3 * limit.std
+    assert abs(limit.value - truth["saturation.limit"]) < 3 * limit.std
     assert limit.std < 1e-3 * limit.value
