@@ -33,8 +33,10 @@ _DITHERS = 0.5
 _SMOOTH, _REST = 21, 500
 # Samples beside one at rest that count as slow too.
 _AROUND = 3
-# Standard deviations from zero beyond which the sign of a velocity is known.
-_SIGN_KNOWN = 3.0
+# Distance of the outer nodes of Gauss and Hermite from the mean [standard deviations]; their weight is 1/6.
+_NODE = 3.0**0.5
+# Least standard deviation of a velocity over that of the start, and least at all [m/s or rad/s].
+_SLOWEST = (1e-6, 1e-12)
 
 
 class KalmanFilter(eqx.Module):
@@ -81,7 +83,8 @@ class KalmanFilter(eqx.Module):
 
         Source:
             Anderson & Moore (1979), Optimal Filtering, section 8.2; readings are taken one after the other,
-            so that no matrix is inverted.
+            so that no matrix is inverted. Ito & Xiong (2000), Gaussian filters for nonlinear filtering
+            problems, IEEE Trans. Automatic Control 45(5), for the nodes in the velocities.
         """
         drive, n = self.drive, self.readings.shape[1]
         # The state begins with the positions, which the velocities follow.
@@ -104,10 +107,12 @@ class KalmanFilter(eqx.Module):
             errors = size + jnp.arange(m)
             p = p.at[errors, errors].set((drive.gain * self.offset) ** 2)
 
-        def tick(
-            carry: tuple[Array, Array, Array], now: tuple
-        ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array]]:
-            x, p, last = carry
+        axes, rest = jnp.eye(whole + m), np.delete(np.arange(whole), np.arange(n, 2 * n))
+        by_speed, others = axes[speeds], axes[np.append(rest, whole + np.arange(m))]
+        least = jnp.maximum(_SLOWEST[0] * self.spread[n:], _SLOWEST[1])
+
+        def tick(carry: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+            x, p = carry
             u0, u1, t, reading, used, jolt = now
 
             innovations, variances = [], []
@@ -127,23 +132,27 @@ class KalmanFilter(eqx.Module):
                 new = new if self.offset is None else jnp.concatenate([new, error])
                 return new, new
 
-            known = x[speeds] ** 2 > _SIGN_KNOWN**2 * p[speeds, speeds]
-            jacobian, x = jax.jacfwd(step, has_aux=True)(jnp.concatenate([x, jnp.zeros(m)]))
-            a, b = jacobian[:, :whole], jacobian[:, whole:]
+            # A step in which dry friction stops a joint has no slope by its velocity, although it has one by
+            # other velocities that are as likely. Mean and covariance by each velocity are those of its three
+            # nodes; by all else they are those of the slope.
+            centre = jnp.concatenate([x, jnp.zeros(m)])
+            apart = _NODE * jnp.sqrt(p[speeds, speeds] + least**2)
+            moved = apart[:, None] * by_speed
+            ends = jax.vmap(lambda d: step(centre + d)[0])(jnp.concatenate([moved, -moved]))
+            tangent = jax.vmap(lambda d: jax.jvp(step, (centre,), (d,), has_aux=True)[1:], out_axes=(1, None))
+            tangents, x = tangent(others)
+            secants = (ends[:n] - ends[n:]).T / (2 * apart)
+            a = jnp.zeros((whole, whole)).at[:, speeds].set(secants).at[:, rest].set(tangents[:, :-m])
+            b, bends = tangents[:, -m:], (ends[:n] + ends[n:]).T / 2 - x[:, None]
 
-            # A step in which dry friction stops a joint has no slope by its velocity. If the sign of the
-            # velocity is not known, the joint may as well move on: its slope is then not below that of the
-            # last step with a known sign, or the filter would be surer after the step than it can be.
-            slope = a[speeds, speeds]
-            slope = jnp.where(known, slope, jnp.maximum(slope, last))
-            a = a.at[speeds, speeds].set(slope)
-            p = a @ p @ a.T + (b * force_variance) @ b.T
+            x = x + jnp.sum(bends, axis=1) / _NODE**2
+            p = a @ p @ a.T + (b * force_variance) @ b.T + 2 / 9 * bends @ bends.T
             p = p.at[speeds, speeds].add(jolt) if jolt.ndim == 1 else p.at[n : 2 * n, n : 2 * n].add(jolt)
-            return (x, 0.5 * (p + p.T), slope), (jnp.stack(innovations), jnp.stack(variances))
+            return (x, 0.5 * (p + p.T)), (jnp.stack(innovations), jnp.stack(variances))
 
         times = drive.period * jnp.arange(self.command.shape[0])
         inputs = (before, after, times, self.readings, self.used, jolts)
-        out = jax.lax.scan(tick, (x, p, jnp.zeros(n)), inputs)[1]
+        out = jax.lax.scan(tick, (x, p), inputs)[1]
         return out[0][:: self.every], out[1][:: self.every]
 
     def _jolts(self, plant: Plant) -> Array:
