@@ -15,6 +15,7 @@ from jaxid.commands.robot_case import implied_case
 from jaxid.consistency.absent import acts_by_position
 from jaxid.consistency.late_force import LateForce, late_force
 from jaxid.discovery import candidates as cand
+from jaxid.discovery.alone import add_alone
 from jaxid.discovery.at_rest.naming import Found, named_at_rest
 from jaxid.discovery.final import final_machine, machine_with
 from jaxid.discovery.in_loop.by_joint import explore_by_joint
@@ -230,7 +231,7 @@ def _explore_forces(
 def _searched(search: Search, most: int) -> list[Step]:
     """Run a search, with the laws of all joints at once where many are missing, and return its steps."""
     steps = search.run(most, lambda search, first: add_together(search, first, most, least=LEAST_AT_ONCE))
-    return add_together(search, steps, most)
+    return add_alone(search, add_together(search, steps, most), most)
 
 
 def _under_better_hold(session: Session, search: Search, machine: Machine) -> Session | None:
@@ -368,8 +369,9 @@ def start_search(
         searched = tuple(cls for cls in searched if not acts_by_position(cls(**starts[cls])))
     union = build_candidate_model(baseline.machine, data, searched)
     others = tuple(v.data for v in session.validations)
+    guess = tuple(session.machine.parameters.guess)
     if not session.more:
-        return baseline, Search(union, data, floor, colour, others, progress)
+        return baseline, Search(union, data, floor, colour, others, progress, guess=guess)
 
     def view(run: OpenedLog) -> cand.View:
         assert run.own is not None, "every log of several has values of its own, or none"
@@ -387,6 +389,7 @@ def start_search(
         view=view(session.fit),
         more=tuple((run.data, view(run)) for run in session.more),
         validation_views=tuple(view(run).unscaled() for run in session.validations),
+        guess=guess,
     )
     return baseline, search
 

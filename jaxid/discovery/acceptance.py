@@ -48,6 +48,7 @@ class Acceptance:
         view: View of the log on the superset; None: it is the only one that is fitted.
         more: Further logs to fit with their views.
         validation_views: Views of the validation logs; empty: they have none.
+        guess: Values of the case's unknowns before any fit; empty: not known.
     """
 
     superset: cand.CandidateModel
@@ -58,6 +59,7 @@ class Acceptance:
     view: cand.View | None = None
     more: tuple[tuple[Prepared, cand.View], ...] = ()
     validation_views: tuple[cand.View, ...] = ()
+    guess: tuple[float, ...] = ()
 
     # Least part of a residual that counts as gap.
     least_gap: ClassVar[float] = 0.5
@@ -228,13 +230,16 @@ class Acceptance:
         """Return the name of a parameter of the plant, positive by physics, that an effect takes away.
 
         Along motions at even speeds a limit of the drive that equals dry friction leaves sign(u) against
-        sign(v), which agree, and no inertia.
+        sign(v), which agree, and no inertia. A fit without a limit that most of the log is at makes the
+        inertia too large: one near its guess is not lost.
 
         Args:
             old, new: All unknowns, without and with the added effects.
         """
-        for f, before, after in zip(self.superset.machine.parameters.free, old, new, strict=True):
-            if f.effect is None and f.sign == "positive" and after < _NOTHING * before:
+        usual = old.copy()
+        usual[: len(self.guess)] = np.minimum(usual[: len(self.guess)], self.guess)
+        for f, least, after in zip(self.superset.machine.parameters.free, usual, new, strict=True):
+            if f.effect is None and f.sign == "positive" and after < _NOTHING * least:
                 return f.name
         return ""
 

@@ -69,13 +69,16 @@ class Screen:
         return ev.held_out(ev.grams(columns, self.blocks), mixed, squares)
 
 
-def screen_candidates(search: Search, model: Model, *, ahead: bool = False) -> Screen:
+def screen_candidates(
+    search: Search, model: Model, *, ahead: bool = False, by_sensors: bool = False
+) -> Screen:
     """Evaluate every candidate at every start, whiten, score, and calibrate the threshold.
 
     Args:
         search: The search, with superset, samples and noise.
         model: The model to extend.
         ahead: True to score every two candidates together too.
+        by_sensors: True to take what the model leaves for noise of the sensors, whatever its colour.
     """
     active = search.fitted_by(model.added)
     e, jacobian = search.domain.evaluate(search.samples, model.theta, active)
@@ -87,8 +90,12 @@ def screen_candidates(search: Search, model: Model, *, ahead: bool = False) -> S
     points = search.domain.points(rest, search.samples, model.theta, e)
     points = [p for p in points if has_influence(p, counts, scale)]
 
-    extra, noisy = all_columns(search.superset, e, base, points, counts, scale)
-    whitener, noise = fit_whitener(e, base, extra, counts, search.colour, noisy)
+    if by_sensors:
+        whitener = ev.Whitener(search.colour, counts)
+        noise = whitener(e[..., None])[:, 0]
+    else:
+        extra, noisy = all_columns(search.superset, e, base, points, counts, scale)
+        whitener, noise = fit_whitener(e, base, extra, counts, search.colour, noisy)
     out = Screen.of(whitener, e, base)
     white, columns = whitener(e[..., None]), whitener(base)
 

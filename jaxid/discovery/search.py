@@ -32,7 +32,7 @@ _KEPT = 0.5
 _MUCH = 0.33
 _MOST_OF_IT = 0.5
 # An effect below the threshold is added if it closes more than this part of the gap, by this evidence [nats].
-_NEARLY_ALL, _CERTAIN = 0.99, 100.0
+NEARLY_ALL, CERTAIN = 0.99, 100.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +86,7 @@ class Search:
         view: View of the log on the superset; None: it is the only one that is fitted.
         more: Further logs to fit with their views.
         validation_views: Views of the validation logs; empty: they have none.
+        guess: Values of the case's unknowns before any fit; empty: not known.
     """
 
     superset: cand.CandidateModel
@@ -98,6 +99,7 @@ class Search:
     view: cand.View | None = None
     more: tuple[tuple[Prepared, cand.View], ...] = ()
     validation_views: tuple[cand.View, ...] = ()
+    guess: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         self.acceptance = self._acceptance()
@@ -120,6 +122,7 @@ class Search:
             self.view,
             self.more,
             self.validation_views,
+            self.guess,
         )
 
     @property
@@ -272,7 +275,7 @@ class Search:
         refitted = []
         for score in shortlist(promising):
             self.progress(f"refitting with {score.candidate.label}")
-            refitted.append(self._refit(model, score, screened))
+            refitted.append(self.refit(model, score, screened))
         refitted.sort(key=lambda s: -s.total)
         rest = [s for s in screened.scores if all(s.candidate is not r.candidate for r in refitted)]
 
@@ -298,10 +301,12 @@ class Search:
         The surrogates of the threshold are what no candidate explains linearly. Of an effect that acts in few
         moments, as a limit does, much of that is the effect itself.
         """
-        if evidence < _CERTAIN:
-            return False
+        return evidence >= CERTAIN and self._closes_nearly_all(model, score)
+
+    def _closes_nearly_all(self, model: Model, score: Score) -> bool:
+        """Check that a refitted effect leaves next to nothing of a model's gap."""
         old, new = (self.acceptance.residual(t) for t in (model.theta, score.refitted))
-        return self.acceptance.closed(old, new) > _NEARLY_ALL
+        return self.acceptance.closed(old, new) > NEARLY_ALL
 
     def _two(
         self, model: Model, screened: Screen, one: Score | None, broken: list[cand.Candidate]
@@ -323,14 +328,14 @@ class Search:
                 continue
             self.progress("refitting with " + " and ".join(p.candidate.label for p in points))
             first, second = (Score(p.candidate, p.start, g, 0.0) for p, g in zip(points, guess, strict=True))
-            both = self._refit(model, second, screened, beside=first)
+            both = self.refit(model, second, screened, beside=first)
             old, new = (self.acceptance.residual(t) for t in (model.theta, both.refitted))
             enough = self.acceptance.closed(old, new) > _MOST_OF_IT and (
                 one is None or both.total > one.total
             )
             if enough and not both.reason:
-                only_first = replace(self._refit(model, first, screened), reason="")
-                only_second = self._refit(model, second, screened)
+                only_first = replace(self.refit(model, first, screened), reason="")
+                only_second = self.refit(model, second, screened)
                 # The first is added alone; the evidence of each is the loss without it.
                 added = (
                     replace(
@@ -364,9 +369,14 @@ class Search:
         for k in range(len(self.model.added)):
             model, named = self.model, self.model.added[k]
             self.progress(f"searching for a replacement of {named.label}")
-            _, scores, limit = self.best(self.without(model, named), MODEST, named)
+            without = self.without(model, named)
+            _, scores, limit = self.best(without, MODEST, named)
             good = [s for s in scores if s.theta is not None and not s.reason and s.evidence > limit]
             current = next((s for s in scores if s.candidate is named), None)
+            if current is not None and current.evidence < limit:
+                # So large an effect passes for coloured noise where it is missing. Rivals leave as little.
+                good = [s for s in good if self._closes_nearly_all(without, s)]
+                current = replace(current, evidence=self.loss(model, without)[0])
             if not good or current is None:
                 out[k] = ()
                 continue
@@ -433,8 +443,15 @@ class Search:
             why=why,
         )
 
-    def _refit(self, model: Model, score: Score, screened: Screen, beside: Score | None = None) -> Score:
-        """Refit a model with one more effect, or with two, and score the gain."""
+    def refit(self, model: Model, score: Score, screened: Screen, beside: Score | None = None) -> Score:
+        """Refit a model with one more effect, or with two, and score the gain.
+
+        Args:
+            model: The model to extend.
+            score: The effect, with its starts.
+            screened: The screen that scored it.
+            beside: Another effect that is added too; None: there is none.
+        """
         new = [s for s in (beside, score) if s is not None]
         active = self.fitted_by([*model.added, *[s.candidate for s in new]])
         starts = []

@@ -57,7 +57,8 @@ def add_together(search: Search, steps: list[Step], most: int, least: int = 1) -
     new = len(model.added)
     if not least <= new <= most or not _closes(search, old, model.theta) or _objection(search, old, model):
         return steps
-    return _taken_over(search, steps, old, model, most)
+    why = "laws of several joints together explain what it stood for"
+    return taken_over(search, steps, old, model, most, why)
 
 
 def _closes(search: Search, old: Model, theta: np.ndarray) -> bool:
@@ -110,8 +111,22 @@ def _objection(search: Search, old: Model, model: Model) -> str:
     return search.acceptance.objection(index, old.theta, model.theta, *confirmed, new)
 
 
-def _taken_over(search: Search, steps: list[Step], old: Model, model: Model, most: int) -> list[Step]:
-    """Put a model in the place of the search's, and continue from there."""
+def taken_over(
+    search: Search, steps: list[Step], old: Model, model: Model, most: int, why: str
+) -> list[Step]:
+    """Put a model in the place of the search's, and continue from there.
+
+    Args:
+        search: The search.
+        steps: Its steps.
+        old: Its model.
+        model: The model that takes the place.
+        most: Largest number of effects in the model.
+        why: Reason for dropping an effect of the old model.
+
+    Returns:
+        Steps of the search, with those that follow.
+    """
     scores = {c.label: _score(search, model, c) for c in model.added}
     kept = [c for c in old.added if c.label in scores]
     # What stays was scored while the others were missing.
@@ -123,7 +138,6 @@ def _taken_over(search: Search, steps: list[Step], old: Model, model: Model, mos
     ]
     for c in old.added:
         if c.label not in scores:
-            why = "laws of several joints together explain what it stood for"
             steps.append(search.step(_fitted(search, kept), dropped=c, threshold=search.limit, why=why))
 
     added = [*kept]
