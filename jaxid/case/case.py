@@ -378,7 +378,7 @@ def _hint_at_top(name: str, value: Any) -> str:
 
 def _toml(path: Path) -> dict[str, Any]:
     if not path.exists():
-        beside = sorted(p.name for p in path.parent.glob("*.toml"))[:8]
+        beside = sorted(p.name for p in path.parent.glob("*.toml") if _has_plant(p))[:8]
         hint = f"check the path; case files in that folder: {', '.join(beside) or 'none'}"
         raise InputError("no such file", where=str(path), hint=hint)
     try:
@@ -392,6 +392,14 @@ def _toml(path: Path) -> dict[str, Any]:
     except OSError as error:
         what = f"cannot be read ({error.strerror})"
         raise InputError(what, where=str(path), hint="name a TOML file that may be read") from error
+
+
+def _has_plant(path: Path) -> bool:
+    """Check that a TOML file may be a case: it has the table that every case has."""
+    try:
+        return "[plant" in path.read_text(encoding="utf-8", errors="ignore")
+    except OSError:
+        return False
 
 
 def _within_prior(tables: Mapping[str, Any], settings: OutputError, root: Spot) -> WithinPrior | None:

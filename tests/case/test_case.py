@@ -195,3 +195,11 @@ def test_validation_inherits_the_disturbance(tmp_path):
 def test_bounds_are_open_where_none_are_given(tmp_path):
     value = load_case(write(tmp_path, GOOD)).effects[0].parameters["coefficient"][0]
     assert (value.lower, value.upper) == (-math.inf, math.inf)
+
+
+def test_a_missing_case_names_the_cases_beside_it_and_no_other_toml_file(tmp_path):
+    (tmp_path / "axis.toml").write_text('[plant]\nkind = "axis"\n')
+    (tmp_path / "pyproject.toml").write_text("[project]\n")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(InputError, match=r"no such file; .* in that folder: axis\.toml$"):
+        load_case(tmp_path / "axes.toml")
