@@ -28,7 +28,6 @@ def add_alone(search: Search, steps: list[Step], most: int) -> list[Step]:
     if most < 1 or search.acceptance.at_floor(old.theta):
         return steps
     search.progress("searching for one effect that leaves nothing but noise")
-    search.finer(base)
     screened = screen_candidates(search, base, by_sensors=True)
     for score in shortlist([s for s in screened.scores if s.evidence > screened.threshold]):
         found = search.refit(base, score, screened)
