@@ -191,7 +191,7 @@ class Saturation(Effect):
     @classmethod
     def finer_starts(cls, scales: Scales) -> list[dict[str, float]]:
         # A drive that is at its limit for much of the log: only starts near the limit are better than none.
-        # A fast loop that runs away from its drive may ask for a thousand times the limit.
+        # A fast loop whose drive is too weak may ask for much more than the limit.
         return [{"limit": float(limit)} for limit in scales.peak_force * np.geomspace(0.001, 0.9, 40)]
 
 

@@ -6,6 +6,7 @@ case. Noise of the force is process noise, and noise of the encoders is measurem
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
@@ -83,8 +84,7 @@ class KalmanFilter(eqx.Module):
 
         Source:
             Anderson & Moore (1979), Optimal Filtering, section 8.2; readings are taken one after the other,
-            so that no matrix is inverted. Ito & Xiong (2000), Gaussian filters for nonlinear filtering
-            problems, IEEE Trans. Automatic Control 45(5), for the nodes in the velocities.
+            so that no matrix is inverted.
         """
         drive, n = self.drive, self.readings.shape[1]
         # The state begins with the positions, which the velocities follow.
@@ -95,7 +95,7 @@ class KalmanFilter(eqx.Module):
         x0 = State(self.start[:n], self.start[n:], plant.initial_states(before[0]))
         x, unravel = ravel_pytree(x0)
         size, m = x.size, before.shape[1]
-        moving, speeds = jnp.arange(2 * n), n + jnp.arange(n)
+        moving, speeds = np.arange(2 * n), n + np.arange(n)
         jolts = self._jolts(plant)
         advance = drive.stepper(plant, x0, (before[0],) if held else (before[0], after[0]))
         force_variance, reading_variance = (drive.gain * force_noise) ** 2, reading_noise**2
@@ -107,8 +107,6 @@ class KalmanFilter(eqx.Module):
             errors = size + jnp.arange(m)
             p = p.at[errors, errors].set((drive.gain * self.offset) ** 2)
 
-        axes, rest = jnp.eye(whole + m), np.delete(np.arange(whole), np.arange(n, 2 * n))
-        by_speed, others = axes[speeds], axes[np.append(rest, whole + np.arange(m))]
         least = jnp.maximum(_SLOWEST[0] * self.spread[n:], _SLOWEST[1])
 
         def tick(carry: tuple[Array, Array], now: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -124,29 +122,14 @@ class KalmanFilter(eqx.Module):
                 innovations.append(e)
                 variances.append(s)
 
-            def step(z: Array) -> tuple[Array, Array]:
+            def step(z: Array) -> Array:
                 state, error, noise = z[:size], z[size:whole], z[whole:]
                 force = noise if self.offset is None else error + noise
                 ends = (u0 + force,) if held else (u0 + force, u1 + force)
                 new = ravel_pytree(advance(unravel(jnp.asarray(state)), ends, t))[0]
-                new = new if self.offset is None else jnp.concatenate([new, error])
-                return new, new
+                return new if self.offset is None else jnp.concatenate([new, error])
 
-            # A step in which dry friction stops a joint has no slope by its velocity, although it has one by
-            # other velocities that are as likely. Mean and covariance by each velocity are those of its three
-            # nodes; by all else they are those of the slope.
-            centre = jnp.concatenate([x, jnp.zeros(m)])
-            apart = _NODE * jnp.sqrt(p[speeds, speeds] + least**2)
-            moved = apart[:, None] * by_speed
-            ends = jax.vmap(lambda d: step(centre + d)[0])(jnp.concatenate([moved, -moved]))
-            tangent = jax.vmap(lambda d: jax.jvp(step, (centre,), (d,), has_aux=True)[1:], out_axes=(1, None))
-            tangents, x = tangent(others)
-            secants = (ends[:n] - ends[n:]).T / (2 * apart)
-            a = jnp.zeros((whole, whole)).at[:, speeds].set(secants).at[:, rest].set(tangents[:, :-m])
-            b, bends = tangents[:, -m:], (ends[:n] + ends[n:]).T / 2 - x[:, None]
-
-            x = x + jnp.sum(bends, axis=1) / _NODE**2
-            p = a @ p @ a.T + (b * force_variance) @ b.T + 2 / 9 * bends @ bends.T
+            x, p = by_nodes(step, jnp.concatenate([x, jnp.zeros(m)]), p, force_variance, speeds, least)
             p = p.at[speeds, speeds].add(jolt) if jolt.ndim == 1 else p.at[n : 2 * n, n : 2 * n].add(jolt)
             return (x, 0.5 * (p + p.T)), (jnp.stack(innovations), jnp.stack(variances))
 
@@ -178,6 +161,48 @@ class KalmanFilter(eqx.Module):
         at_samples = jnp.einsum("tij,tj,tkj->tik", push, kicks**2, push)
         every_tick = jnp.zeros((len(self.kicks), *one.shape))
         return every_tick.at[:: self.every].set(at_samples)
+
+
+def by_nodes(
+    step: Callable[[Array], Array],
+    centre: Float[Array, " k"],
+    p: Float[Array, "x x"],
+    force_variance: Float[Array, " m"],
+    speeds: np.ndarray,
+    least: Float[Array, " n"],
+) -> tuple[Float[jax.Array, " x"], Float[jax.Array, "x x"]]:
+    """Predict mean and covariance of the state after a step.
+
+    A step in which dry friction stops a joint has no slope by its velocity, although it has one by other
+    velocities that are as likely. Mean and covariance by each velocity are those of its three nodes; by all
+    else they are those of the slope.
+
+    Args:
+        step: Function from state and noise to the next state.
+        centre: State, and the noise's mean, (x + m,).
+        p: Covariance of the state, (x, x).
+        force_variance: Variance of the noise, (m,).
+        speeds: Indices of the velocities in the state, (n,).
+        least: Least distance that counts, as a standard deviation of each velocity, (n,) [m/s or rad/s].
+
+    Source:
+        Ito & Xiong (2000), Gaussian filters for nonlinear filtering problems, IEEE Trans. Automatic Control
+        45(5).
+    """
+    whole, n, m = len(p), len(speeds), len(force_variance)
+    axes, rest = jnp.eye(whole + m), np.delete(np.arange(whole), speeds)
+    others = axes[np.append(rest, whole + np.arange(m))]
+
+    apart = _NODE * jnp.sqrt(p[speeds, speeds] + least**2)
+    moved = apart[:, None] * axes[speeds]
+    ends = jax.vmap(lambda d: step(centre + d))(jnp.concatenate([moved, -moved]))
+    x, tangents = jax.vmap(lambda d: jax.jvp(step, (centre,), (d,)), out_axes=(None, 1))(others)
+
+    secants = (ends[:n] - ends[n:]).T / (2 * apart)
+    a = jnp.zeros((whole, whole)).at[:, speeds].set(secants).at[:, rest].set(tangents[:, :-m])
+    b, bends = tangents[:, -m:], (ends[:n] + ends[n:]).T / 2 - x[:, None]
+    mean = x + jnp.sum(bends, axis=1) / _NODE**2
+    return mean, a @ p @ a.T + (b * force_variance) @ b.T + 2 / 9 * bends @ bends.T
 
 
 def make_filter(

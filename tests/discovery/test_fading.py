@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.discovery.at_rest import fading
 from tests.support.hidden_effect import search_hidden
 from truth.axis.machines import moves
 from truth.axis.stepper import Loop, Machine, Sensor, simulate
@@ -53,8 +54,14 @@ def test_a_break_away_friction_stays_one():
 
 
 @pytest.mark.slow
-def test_a_break_away_friction_that_a_fading_one_imitates_stays_one(tmp_path):
-    """A servo with little noise: the fading friction gains 734 nats, the true one more."""
+@pytest.mark.parametrize("certain", [False, True])
+def test_a_break_away_friction_that_a_fading_one_imitates_stays_one(tmp_path, monkeypatch, certain):
+    """On a servo with little noise the fading friction gains 914 nats; the level of that fit is not certain.
+
+    It would not be named if it were: the true friction gains as much.
+    """
+    if certain:
+        monkeypatch.setattr(fading, "_is_clear", lambda found: True)
     d, truth = search_hidden(tmp_path, "static_friction", "servo", 0.3, 18021)
     assert d.kinds == ["static_friction"]
     value = d.parameters["static_friction.level"]
