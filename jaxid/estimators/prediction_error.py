@@ -35,7 +35,7 @@ from jaxid.numerics.lanes import Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, hessian_notes
 from jaxid.numerics.rows import Rows, assess_together
-from jaxid.numerics.whiteness import LAGS, band_of_half_the_power, whiteness
+from jaxid.numerics.whiteness import LAGS, band_of_half_the_excess, whiteness
 from jaxid.simulation.replay import Numerics
 from jaxid.simulation.sensor_noise import force_noise
 
@@ -388,9 +388,9 @@ def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estim
 
 
 def _bands(fit: JointLikelihood, rows: Sequence[Rows]) -> str:
-    """Return in words where half of the power of innovations lies that are not white; empty if anywhere."""
+    """Return in words where the innovations have most power beyond white noise; empty if in no one band."""
     bands = [
-        band_of_half_the_power(np.where(c, e, 0.0), 1 / member.part.log.period)
+        band_of_half_the_excess(np.where(c, e, 0.0), 1 / member.part.log.period)
         for member, row in zip(fit.members, rows, strict=True)
         for e, c in zip(row.residual.T, row.counts.T, strict=True)
         if whiteness(e[c]) < _REJECTS
@@ -399,7 +399,7 @@ def _bands(fit: JointLikelihood, rows: Sequence[Rows]) -> str:
     if len(found) != 1:
         return ""
     low, high = found[0]
-    return f", and half of their power lies from {low:.2g} to {high:.2g} Hz"
+    return f", and half of what exceeds white noise lies from {low:.2g} to {high:.2g} Hz"
 
 
 def _by_hessian(

@@ -11,6 +11,9 @@ from jaxtyping import Float
 LAGS = 20
 # Bins of the spectrum at the least, samples of a segment at the most, and the widest band that is one.
 _FEWEST_BINS, _SEGMENT, _WIDEST = 16, 512, 0.2
+# Factor over the median of the spectrum beyond which a bin is no scatter of white noise, and the least part
+# of the power that such bins must hold beyond the median.
+_SCATTER, _LEAST = 2.0, 0.05
 
 
 def whiteness(z: Float[np.ndarray, " time"], lags: int = LAGS) -> float:
@@ -29,16 +32,18 @@ def whiteness(z: Float[np.ndarray, " time"], lags: int = LAGS) -> float:
     return float(scipy.stats.chi2.sf(statistic, lags))
 
 
-def band_of_half_the_power(z: Float[np.ndarray, " time"], rate: float) -> tuple[float, float] | None:
-    """Return the narrowest band that holds half of the power.
+def band_of_half_the_excess(z: Float[np.ndarray, " time"], rate: float) -> tuple[float, float] | None:
+    """Return the narrowest band that holds half of the power beyond that of white noise.
+
+    The median of the spectrum is taken for the white noise.
 
     Args:
         z: Residuals at equal intervals, (time,); zero where a sample does not count.
         rate: Samples per second [Hz].
 
     Returns:
-        Lower and upper edge [Hz]; None if the band takes more than a fifth of the spectrum, or there are too
-        few samples.
+        Lower and upper edge [Hz]; None if the band takes more than a fifth of the spectrum, if less than a
+        twentieth of the power is beyond the white noise, or if there are too few samples.
 
     Source:
         Welch (1967), IEEE Trans. Audio and Electroacoustics 15, for the spectrum.
@@ -52,12 +57,14 @@ def band_of_half_the_power(z: Float[np.ndarray, " time"], rate: float) -> tuple[
         nperseg=segment,
         detrend=False,  # pyright: ignore[reportArgumentType] (SciPy's stubs know names only)
     )
-    bins, total = len(power), np.sum(power)
-    if not total > 0:
+    white = np.median(power)
+    excess = np.where(power > _SCATTER * white, power - white, 0.0)
+    bins, total = len(power), np.sum(excess)
+    if not total > _LEAST * np.sum(power):
         return None
-    before = np.concatenate([[0.0], np.cumsum(power)]) / total
+    before = np.concatenate([[0.0], np.cumsum(excess)]) / total
 
-    # For each first bin, the last one with which half of the power is reached.
+    # For each first bin, the last one with which half of the excess is reached.
     last = np.searchsorted(before, before[:-1] + 0.5 - 1e-12)
     width = np.where(last <= bins, last - np.arange(bins), bins)
     first = int(np.argmin(width))
