@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.logs.log import Log
-from jaxid.logs.prepare import Prepared
+from jaxid.logs.prepare import Prepared, prepare
 from jaxid.machine import Machine
 from jaxid.model.plant import Plant
 from jaxid.numerics.kept import kept_jit
@@ -135,6 +135,22 @@ def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray,
         return np.full(log.position.shape[1], np.nan)
     f, power = noise_density(machine, log, data)
     return np.sqrt(np.trapezoid(power, f, axis=0))
+
+
+def left_by_filter(machine: Machine, run: OpenedLog) -> Float[np.ndarray, " n"]:
+    """Return the RMS force that the filter leaves of a log that the machine simulates [N or N m], by joint.
+
+    A log of few samples between two reversals has motion beyond the band of its filter. Friction then turns
+    at a wrong time in the filtered motion, even if the model is complete. It is zero if the simulation fails.
+    """
+    machine, nothing = run.machine(machine), np.zeros(run.data.q.shape[1])
+    gap = simulated(machine, run.log)
+    if gap is None or not all(run.log.measured):
+        return nothing
+    force = run.log.force if gap.command is None else gap.command
+    log = replace(run.log, position=gap.position, force=force)
+    data = prepare(log, machine.gain, run.data.recipe, machine.hold_period)
+    return np.nan_to_num(force_gap(machine, data).rms)
 
 
 def row_noise(machine: Machine, log: Log) -> Float[np.ndarray, " n"]:

@@ -40,7 +40,7 @@ from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
 from jaxid.estimators.needs import need_force, need_known_controller, need_known_reference
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
 from jaxid.estimators.several.parts import parts_of
-from jaxid.gap import Gap, force_gap, gaps, noise_floor
+from jaxid.gap import Gap, force_gap, gaps, left_by_filter, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
@@ -190,7 +190,7 @@ def _explore_forces(
         ahead = begin(_with_effects, session, machine, refit)
     where = where_of(search, steps[0], session)
     final, effects = _simulable(session, search, baseline.machine, steps, most, progress)
-    verdict = _verdict(effects, where, steps, search)
+    verdict = "found" if effects else _verdict_on_none(where, steps, search, session, baseline.machine)
     late = _late_force(session, search, baseline.machine)
 
     progress("refitting in simulation" if refit else "simulating")
@@ -463,15 +463,19 @@ def _where_on(
     return locate(-e, unshared, data, colour, wanted, search.superset.machine.plant)
 
 
-def _verdict(effects: tuple[NamedEffect, ...], where: Where, steps: list[Step], search: Search) -> str:
-    if effects:
-        return "found"
-    baseline = steps[0].theta
-    rms = _rms(search, search.samples, baseline)
-    if not search.acceptance.above_numerics(baseline):
+def _verdict_on_none(
+    where: Where, steps: list[Step], search: Search, session: Session, declared: Machine
+) -> str:
+    """Return the verdict on a search that added nothing, by the residual of the declared model."""
+    if not search.acceptance.above_numerics(steps[0].theta):
         return "nothing_missing"
-    above, far = (bool(np.any(rms > factor * search.floor)) for factor in (_ABOVE_FLOOR, _FAR_ABOVE))
-    return "unexplained" if far or (above and where.significant) else "nothing_missing"
+    rms = _rms(search, search.samples, steps[0].theta)
+    if where.significant and np.any(rms > _ABOVE_FLOOR * search.floor):
+        return "unexplained"
+    if not np.any(rms > _FAR_ABOVE * search.floor):
+        return "nothing_missing"
+    floor = np.hypot(search.floor, left_by_filter(declared, session.fit))
+    return "unexplained" if np.any(rms > _FAR_ABOVE * floor) else "nothing_missing"
 
 
 def _round(search: Search, step: Step) -> Round:

@@ -8,6 +8,7 @@ from jaxid.commands.discover import start_search
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.search import Model
 from jaxid.effects import EFFECTS
+from jaxid.gap import left_by_filter
 from jaxid.model.unknowns import free_effect
 from truth.axis.cases import write_case
 from truth.hidden import cases as hidden_cases
@@ -58,6 +59,17 @@ def test_a_complete_model_gets_no_ripple(tmp_path):
     found = jaxid.discover(case, logs[0], refit=False)
     assert found.verdict == "nothing_missing"
     assert [r.step.dropped.kind for r in found.rounds if r.step.why] == ["cogging"]
+
+
+def test_the_filter_of_a_short_coarse_log_leaves_more_than_its_noise_and_another_does_not(tmp_path):
+    left = {}
+    for seed in (6410, 6252):
+        path, logs = opened(seed, tmp_path)
+        session = jaxid.open_session(path, logs[0], align_hold=True)
+        baseline, search = start_search(session)
+        left[seed] = left_by_filter(baseline.machine, session.fit) / search.floor
+    assert left[6410] > 3.0
+    assert left[6252] < 0.1
 
 
 @pytest.mark.parametrize("closed", [True, False])
