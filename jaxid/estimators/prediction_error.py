@@ -399,7 +399,7 @@ def _bands(fit: JointLikelihood, rows: Sequence[Rows]) -> str:
     if len(found) != 1:
         return ""
     low, high = found[0]
-    return f", and half of what exceeds white noise lies from {low:.2g} to {high:.2g} Hz"
+    return f", and half of what exceeds white noise lies from {low:.3g} to {high:.3g} Hz"
 
 
 def _by_hessian(

@@ -290,8 +290,10 @@ class Draft:
         if rough.has_offset and measures.motion == "linear":
             plant.questions.append('is the axis vertical? Then orientation = "vertical"')
         values = Section("[plant.parameters]", {"inertia": inertia}, {"inertia": units.label("inertia")})
+        # Rounded down: 100 % would say that nothing is missing.
+        percent = np.floor(1000 * rough.explained) / 10
         values.assumed.append(
-            f"guesses are those of a rough fit: it explains {100 * rough.explained:.0f} % of the force"
+            f"guesses are those of a rough fit: it explains {percent:g} % of the variance of the force"
         )
         return [plant, values]
 
