@@ -15,8 +15,8 @@ from jaxid.commands.robot_case import implied_case
 from jaxid.consistency.absent import acts_by_position
 from jaxid.consistency.late_force import LateForce, late_force
 from jaxid.discovery import candidates as cand
-from jaxid.discovery.alone import add_alone
 from jaxid.discovery.at_rest.naming import Found, named_at_rest
+from jaxid.discovery.by_sensors import add_by_sensors
 from jaxid.discovery.final import final_machine, machine_with
 from jaxid.discovery.in_loop.by_joint import explore_by_joint
 from jaxid.discovery.in_loop.confirm import WHY, hindering
@@ -231,7 +231,7 @@ def _explore_forces(
 def _searched(search: Search, most: int) -> list[Step]:
     """Run a search, with the laws of all joints at once where many are missing, and return its steps."""
     steps = search.run(most, lambda search, first: add_together(search, first, most, least=LEAST_AT_ONCE))
-    return add_alone(search, add_together(search, steps, most), most)
+    return add_by_sensors(search, add_together(search, steps, most), most)
 
 
 def _under_better_hold(session: Session, search: Search, machine: Machine) -> Session | None:

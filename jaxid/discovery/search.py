@@ -24,13 +24,13 @@ _GONE = 1e-2
 # An effect in the model is dropped if it closes less than this part of the gap: a third of the part that it
 # must close to be named.
 SUPERFLUOUS = 0.05
-# Two effects are added at once if together they close `_MOST_OF_IT` of the gap, and gain more than the best
+# Two effects are added at once if together they close `MOST_OF_IT` of the gap, and gain more than the best
 # single effect with any partner, by `_CLEARLY` times the threshold of noise and by `_MUCH` of their gain. An
 # effect whose refit keeps less than `_KEPT` of its linear evidence takes no part in pairs.
 _CLEARLY = 3.0
 _KEPT = 0.5
 _MUCH = 0.33
-_MOST_OF_IT = 0.5
+MOST_OF_IT = 0.5
 # An effect below the threshold is added if it closes more than this part of the gap, by this evidence [nats].
 NEARLY_ALL, CERTAIN = 0.99, 100.0
 
@@ -330,9 +330,7 @@ class Search:
             first, second = (Score(p.candidate, p.start, g, 0.0) for p, g in zip(points, guess, strict=True))
             both = self.refit(model, second, screened, beside=first)
             old, new = (self.acceptance.residual(t) for t in (model.theta, both.refitted))
-            enough = self.acceptance.closed(old, new) > _MOST_OF_IT and (
-                one is None or both.total > one.total
-            )
+            enough = self.acceptance.closed(old, new) > MOST_OF_IT and (one is None or both.total > one.total)
             if enough and not both.reason:
                 only_first = replace(self.refit(model, first, screened), reason="")
                 only_second = self.refit(model, second, screened)

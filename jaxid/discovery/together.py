@@ -11,8 +11,8 @@ from jaxid.discovery import candidates as cand
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import SUPERFLUOUS, Model, Search, Step
 
-# Laws take the place of what was found one by one if they close this part of the gap that is left.
-_NEARLY_ALL = 0.9
+# Effects take the place of what was found one by one if they close this part of the gap that is left.
+TAKES_OVER = 0.9
 # Laws that are added before any single effect: fewer are found one by one, beside effects that resemble them.
 LEAST_AT_ONCE = 6
 
@@ -63,7 +63,7 @@ def add_together(search: Search, steps: list[Step], most: int, least: int = 1) -
 
 def _closes(search: Search, old: Model, theta: np.ndarray) -> bool:
     residuals = (search.acceptance.residual(t) for t in (old.theta, theta))
-    return search.acceptance.closed(*residuals) > _NEARLY_ALL
+    return search.acceptance.closed(*residuals) > TAKES_OVER
 
 
 def _fitted(search: Search, laws: Sequence[cand.Candidate]) -> Model:
