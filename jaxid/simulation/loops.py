@@ -92,7 +92,7 @@ class Drive(eqx.Module):
             whole, solver = jnp.asarray(self.period), self.solver
             return lambda x, ends, t: solver(plant, x, ends, t, whole)
         plant = plant.prepared()
-        if not self.switches(plant):
+        if len(ends) == 1 or not self.switches(plant):
             return self._fixed_steps(plant, x, ends, jnp.asarray(self.period))
 
         shift = plant.command_delays(1)[0] / self.period

@@ -30,9 +30,7 @@ def test_the_friction_of_the_table_is_named_both_ways(both_ways):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="0.302 % off with four steps a sample, 0.12 % with eight"
-)
+@pytest.mark.xfail(strict=True, reason="0.302 % off with four steps a sample, 0.12 % with eight")
 def test_the_level_backwards_is_within_three_thousandths(both_ways):
     name = "velocity_hysteresis[2].level_negative"
     assert both_ways.after.value(name) == pytest.approx(stages.TRUTH[1][name], rel=3e-3)

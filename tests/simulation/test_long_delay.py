@@ -12,7 +12,7 @@ from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.gap import simulated
 from jaxid.results.verdict.absurd import remarks_on
 from jaxid.session import Session, open_session
-from jaxid.simulation.replay import remembered_ticks
+from jaxid.simulation.replay import exact_numerics, make_replay, remembered_ticks
 from truth.axis.cases import case_text
 from truth.axis.machines import Setup, moves
 from truth.axis.stepper import Loop, Machine, Sensor
@@ -53,6 +53,17 @@ def test_the_memory_is_as_long_as_guess_and_max_need(delay, ticks):
     delay = delay if isinstance(delay, dict) else {"guess": delay}
     session = opened(delay)
     assert remembered_ticks(session.machine, session.fit.log) == ticks
+
+
+def test_a_loop_without_a_memory_simulates_a_plant_with_a_delay_of_zero():
+    """A search simulates candidates for a delay so, in a loop that keeps no command."""
+    session = opened(0.0)
+    machine, log = session.machine, session.fit.log
+    runs = []
+    for ticks in (0, 2):
+        numerics = dataclasses.replace(exact_numerics(machine, log), longest_delay=ticks)
+        runs.append(np.asarray(make_replay(machine, log, numerics)(machine.plant).position))
+    np.testing.assert_allclose(runs[0], runs[1], atol=1e-9)
 
 
 def test_a_delay_that_no_loop_can_keep_is_refused():
