@@ -92,7 +92,7 @@ def test_the_missing_effect_is_found(kind, tmp_path):
         kind == "static_friction"
     )
     if d.kinds[0] != kind:
-        # The rival's values are not the truth's; the two must be equally likely, by one whitening of the noise.
+        # The rival's values are not the truth's; the two must be equally likely in the same screen.
         assert kind in [s.candidate.kind for s in d.effects[0].alternatives]
         step = next(r.step for r in d.rounds if r.step.added)
         evidence = {s.candidate.kind: s.evidence for s in step.scores}
