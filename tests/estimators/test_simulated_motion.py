@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxid.errors import InputError
+from jaxid.estimators.common.rerun import span
 from jaxid.estimators.didim import didim
 from jaxid.estimators.instrumental_variable import instrumental_variable
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
@@ -201,3 +202,14 @@ def test_without_a_controller_didim_is_refused_in_one_line(tmp_path, capsys):
     files = place(tmp_path / "in", recorded(), open_case)
     argv = ("identify", *files, "--method", "didim", "-o", tmp_path / "out")
     assert "[controller]" in refused(capsys, tmp_path, *argv, told="the controller is not known")
+
+
+def test_a_column_of_rounding_is_no_instrument():
+    """Normed to one it would be a direction of its own, another one in each step: the search never ended."""
+    columns = np.random.default_rng(0).standard_normal((200, 4))
+    rounding = 1e-16 * np.random.default_rng(1).standard_normal((200, 1))
+    assert span(columns).shape == (200, 4)
+    assert span(np.hstack([columns, rounding])).shape == (200, 4)
+    small = 1e-9 * np.random.default_rng(2).standard_normal((200, 1))
+    assert span(np.hstack([columns, small])).shape == (200, 5)
+    assert span(np.zeros((200, 3))).shape == (200, 0)

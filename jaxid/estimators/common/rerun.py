@@ -25,6 +25,8 @@ _RUNAWAY = 1e3
 _LOST = 0.5
 # Singular values of the scaled columns below this part of the largest count as zero.
 _ROUNDING = 1e-6
+# A column below this part of the largest one is rounding.
+_CANCELLED = 1e-12
 # A fit has converged if a step is smaller than this part of a standard deviation for a white residual.
 _SMALL = 1e-2
 
@@ -178,7 +180,11 @@ def settled(change: Float[np.ndarray, " rows"], e: Float[np.ndarray, " rows"], s
 
 
 def span(columns: Float[np.ndarray, "rows p"]) -> Float[np.ndarray, "rows r"]:
-    """Return an orthonormal basis of the span of some columns, (rows, r)."""
+    """Return an orthonormal basis of the span of some columns, (rows, r).
+
+    A column that cancels to rounding is no direction.
+    """
     norm = np.linalg.norm(columns, axis=0)
-    u, s, _ = np.linalg.svd(columns / np.where(norm > 0, norm, 1.0), full_matrices=False)
+    acts = norm > _CANCELLED * np.max(norm, initial=0.0)
+    u, s, _ = np.linalg.svd(np.where(acts, columns, 0.0) / np.where(acts, norm, 1.0), full_matrices=False)
     return u[:, s > _ROUNDING * s[0]]
