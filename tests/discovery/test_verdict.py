@@ -9,24 +9,28 @@ from jaxid.commands import discover
 
 
 @pytest.mark.parametrize(
-    ("times_the_floor", "significant", "beyond_numerics", "verdict"),
+    ("times_the_floor", "significant", "beyond_numerics", "by_filter", "verdict"),
     [
-        (1.2, True, True, "nothing_missing"),
-        (2.0, False, True, "nothing_missing"),
-        (2.0, True, True, "unexplained"),
-        # So much is never nothing, even if it stands out over no variable.
-        (3.5, False, True, "unexplained"),
-        (3.5, True, False, "nothing_missing"),
+        (1.2, True, True, 0.0, "nothing_missing"),
+        (2.0, False, True, 0.0, "nothing_missing"),
+        (2.0, True, True, 0.0, "unexplained"),
+        # So much is never nothing, even if it stands out over no variable, unless the filter leaves as much.
+        (3.5, False, True, 0.0, "unexplained"),
+        (3.5, False, True, 0.4, "unexplained"),
+        (3.5, False, True, 2.0, "nothing_missing"),
+        (3.5, True, True, 2.0, "unexplained"),
+        (3.5, True, False, 0.0, "nothing_missing"),
     ],
 )
 def test_the_verdict_follows_from_what_is_left(
-    monkeypatch, times_the_floor, significant, beyond_numerics, verdict
+    monkeypatch, times_the_floor, significant, beyond_numerics, by_filter, verdict
 ):
     monkeypatch.setattr(discover, "_rms", lambda search, samples, theta: times_the_floor * search.floor)
+    monkeypatch.setattr(discover, "left_by_filter", lambda machine, run: by_filter * np.array([0.5]))
     search = SimpleNamespace(
         floor=np.array([0.5]),
         samples=None,
         acceptance=SimpleNamespace(above_numerics=lambda theta: beyond_numerics),
     )
     where, steps = SimpleNamespace(significant=significant), [SimpleNamespace(theta=np.zeros(1))]
-    assert discover._verdict((), where, steps, search) == verdict
+    assert discover._verdict_on_none(where, steps, search, SimpleNamespace(fit=None), None) == verdict

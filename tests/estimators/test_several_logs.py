@@ -89,14 +89,15 @@ def test_a_payload_known_in_one_log_separates_the_gain(method, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_exact_command_informs_alike_in_every_log():
+def test_logs_with_an_exact_command_add_their_information():
     # With the samples at rest the noise of log 3 rose to 0.3 % of the force, and its deviations by 20.
     case, logs = tomllib.loads(axis_case(closed=True)), [axis_log(3), axis_log(1)]
-    one, two = (jaxid.identify(case, logs[:n], method="prediction_error").estimate for n in (1, 2))
-    assert np.all(one.std < [0.001, 0.006, 0.001])
-    assert one.std / two.std == pytest.approx(np.full(3, 2**0.5), rel=0.2)
-    for estimate in (one, two):
-        assert np.all(np.abs(estimate.theta - TRUE) < 3 * estimate.std)
+    fits = [jaxid.identify(case, of, method="prediction_error").estimate for of in (logs[0], logs[1], logs)]
+    one, other, both = (fit.std for fit in fits)
+    assert np.all(np.maximum(one, other) < [0.001, 0.006, 0.001])
+    assert both == pytest.approx((one**-2 + other**-2) ** -0.5, rel=0.2)
+    for fit in fits:
+        assert np.all(np.abs(fit.theta - TRUE) < 3 * fit.std)
 
 
 @pytest.mark.slow
