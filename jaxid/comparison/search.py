@@ -229,11 +229,27 @@ class Search:
         best = min(equal, key=lambda r: r.simplicity)
         if best.change.alike:
             return best.model, None
-        if self.chance(best.model, best.change, screen.whitened) * screen.changes > ev.FALSE_POSITIVE:
+        if self._by_chance(best.model, best.change, screen):
             return without, None
         others = tuple(r for r in equal if r is not best and r.change.place != best.change.place)
         chance = screen.false_alarm(best.evidence)
         return best.model, Named(best.change, best.evidence, screen.threshold, chance, others)
+
+    def _by_chance(self, model: Model, change: Change, screen: Screen) -> bool:
+        """Check that a difference may come about by its variation within the logs.
+
+        A change of all logs alike may make the estimates scatter far more than it explains. So the difference
+        is also tested in the model without such changes; the probability counts for both tests.
+        """
+        found = [self.chance(model, change, screen.whitened) * screen.changes]
+        alike = [c for c in model.changes if c.alike]
+        if alike and found[0] > ev.FALSE_POSITIVE:
+            for other in alike:
+                model = model.without(other)
+            model = self.fit(model)
+            plain = self.round(self.fit(model.without(change))).screen
+            found.append(self.chance(model, change, plain.whitened) * plain.changes)
+        return len(found) * min(found) > ev.FALSE_POSITIVE
 
     def without_superfluous(self, model: Model, changes: Sequence[Change]) -> Model:
         """Drop those of some changes whose loss is below the noise, or closes next to nothing."""
