@@ -370,7 +370,7 @@ class Search:
             without = self.without(model, named)
             _, scores, limit = self.best(without, MODEST, named)
             good = [s for s in scores if s.theta is not None and not s.reason and s.evidence > limit]
-            current = next((s for s in scores if s.candidate is named), None)
+            current = screened = next((s for s in scores if s.candidate is named), None)
             if current is not None and current.evidence < limit:
                 # So large an effect passes for coloured noise where it is missing. Rivals leave as little.
                 good = [s for s in good if self._closes_nearly_all(without, s)]
@@ -389,7 +389,13 @@ class Search:
             elif best.candidate is not named:
                 # One that gains more with more parameters does not replace the effect, but is a rival of it.
                 ties = tuple(s for s in good if self._equal(s, current))
-            out[k] = tuple(s for s in ties if s.candidate is not self.model.added[k])
+            ties = tuple(s for s in ties if s.candidate is not self.model.added[k])
+            if self.model.added[k] is named and screened is not None:
+                # The effect was scored with another noise when it was added: what counts is the difference.
+                found = (s.added for s in reversed(steps) if s.added and s.added.candidate is named)
+                shift = next(found, screened).evidence - screened.evidence
+                ties = tuple(replace(s, evidence=s.evidence + shift) for s in ties)
+            out[k] = ties
         return out
 
     def _takes_over(self, model: Model, best: Score, current: Score) -> bool:
