@@ -137,18 +137,23 @@ def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray,
     return np.sqrt(np.trapezoid(power, f, axis=0))
 
 
-def left_by_filter(machine: Machine, run: OpenedLog) -> Float[np.ndarray, " n"]:
-    """Return the RMS force that the filter leaves of a log that the machine simulates [N or N m], by joint.
+def filter_floor(machine: Machine, run: OpenedLog) -> Float[np.ndarray, " n"]:
+    """Compute the RMS force that the filter leaves of a log that the machine simulates [N or N m], by joint.
 
     A log of few samples between two reversals has motion beyond the band of its filter. Friction then turns
-    at a wrong time in the filtered motion, even if the model is complete. It is zero if the simulation fails.
+    at a wrong time in the filtered motion, even if the model is complete.
+
+    Returns:
+        The RMS force, (n,); zero where the loop is not known, since a simulation drifts without it, where a
+        joint has no encoder, or if only velocities were measured.
     """
     machine, nothing = run.machine(machine), np.zeros(run.data.q.shape[1])
-    gap = simulated(machine, run.log)
-    if gap is None or not all(run.log.measured):
+    if not all(run.log.measured) or run.log.integrated:
         return nothing
-    force = run.log.force if gap.command is None else gap.command
-    log = replace(run.log, position=gap.position, force=force)
+    gap = simulated(machine, run.log)
+    if gap is None or gap.command is None:
+        return nothing
+    log = replace(run.log, position=gap.position, force=gap.command)
     data = prepare(log, machine.gain, run.data.recipe, machine.hold_period)
     return np.nan_to_num(force_gap(machine, data).rms)
 

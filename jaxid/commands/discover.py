@@ -40,7 +40,7 @@ from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
 from jaxid.estimators.needs import need_force, need_known_controller, need_known_reference
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
 from jaxid.estimators.several.parts import parts_of
-from jaxid.gap import Gap, force_gap, gaps, left_by_filter, noise_floor
+from jaxid.gap import Gap, filter_floor, force_gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
@@ -474,7 +474,7 @@ def _verdict_on_none(
         return "unexplained"
     if not np.any(rms > _FAR_ABOVE * search.floor):
         return "nothing_missing"
-    floor = np.hypot(search.floor, left_by_filter(declared, session.fit))
+    floor = np.hypot(search.floor, filter_floor(declared, session.fit))
     return "unexplained" if np.any(rms > _FAR_ABOVE * floor) else "nothing_missing"
 
 

@@ -8,7 +8,7 @@ from jaxid.commands.discover import start_search
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.search import Model
 from jaxid.effects import EFFECTS
-from jaxid.gap import left_by_filter
+from jaxid.gap import filter_floor
 from jaxid.model.unknowns import free_effect
 from truth.axis.cases import write_case
 from truth.hidden import cases as hidden_cases
@@ -67,7 +67,7 @@ def test_the_filter_of_a_short_coarse_log_leaves_more_than_its_noise_and_another
         path, logs = opened(seed, tmp_path)
         session = jaxid.open_session(path, logs[0], align_hold=True)
         baseline, search = start_search(session)
-        left[seed] = left_by_filter(baseline.machine, session.fit) / search.floor
+        left[seed] = filter_floor(baseline.machine, session.fit) / search.floor
     assert left[6410] > 3.0
     assert left[6252] < 0.1
 

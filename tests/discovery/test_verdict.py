@@ -26,7 +26,7 @@ def test_the_verdict_follows_from_what_is_left(
     monkeypatch, times_the_floor, significant, beyond_numerics, by_filter, verdict
 ):
     monkeypatch.setattr(discover, "_rms", lambda search, samples, theta: times_the_floor * search.floor)
-    monkeypatch.setattr(discover, "left_by_filter", lambda machine, run: by_filter * np.array([0.5]))
+    monkeypatch.setattr(discover, "filter_floor", lambda machine, run: by_filter * np.array([0.5]))
     search = SimpleNamespace(
         floor=np.array([0.5]),
         samples=None,
