@@ -72,8 +72,6 @@ def test_the_friction_of_the_table_is_named_one_way(one_way):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="a standard deviation of 12 kN counts as identifiable: see precision.py"
-)
+@pytest.mark.xfail(strict=True, reason="a value of 0 with a deviation of 12 kN counts as identifiable")
 def test_a_level_that_never_acts_is_not_identifiable(one_way):
     assert not one_way.parameters["velocity_hysteresis[2].level_negative"].identifiable

@@ -88,16 +88,28 @@ def test_a_payload_known_in_one_log_separates_the_gain(method, tmp_path):
     assert np.all(both.std < 0.03 * np.abs(both.theta))
 
 
-@pytest.mark.slow
-def test_logs_with_an_exact_command_add_their_information():
-    # With the samples at rest the noise of log 3 rose to 0.3 % of the force, and its deviations by 20.
+@pytest.fixture(scope="module")
+def with_exact_command():
+    """Fits of log 3, of log 1, and of both."""
     case, logs = tomllib.loads(axis_case(closed=True)), [axis_log(3), axis_log(1)]
-    fits = [jaxid.identify(case, of, method="prediction_error").estimate for of in (logs[0], logs[1], logs)]
-    one, other, both = (fit.std for fit in fits)
+    return [jaxid.identify(case, of, method="prediction_error").estimate for of in (logs[0], logs[1], logs)]
+
+
+@pytest.mark.slow
+def test_logs_with_an_exact_command_add_their_information(with_exact_command):
+    # With the samples at rest the noise of log 3 rose to 0.3 % of the force, and its deviations by 20.
+    one, other, both = (fit.std for fit in with_exact_command)
     assert np.all(np.maximum(one, other) < [0.001, 0.006, 0.001])
     assert both == pytest.approx((one**-2 + other**-2) ** -0.5, rel=0.2)
-    for fit in fits:
+    for fit in with_exact_command:
         assert np.all(np.abs(fit.theta - TRUE) < 3 * fit.std)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="a factor of 1.77 in the Coulomb friction: log 1 says more of it")
+def test_an_exact_command_informs_alike_in_every_log(with_exact_command):
+    one, _, both = (fit.std for fit in with_exact_command)
+    assert one / both == pytest.approx(np.full(3, 2**0.5), rel=0.2)
 
 
 @pytest.mark.slow
