@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from jaxid import gap
 from jaxid.commands import discover
 
 
@@ -34,3 +35,15 @@ def test_the_verdict_follows_from_what_is_left(
     )
     where, steps = SimpleNamespace(significant=significant), [SimpleNamespace(theta=np.zeros(1))]
     assert discover._verdict_on_none(where, steps, search, SimpleNamespace(fit=None), None) == verdict
+
+
+@pytest.mark.parametrize(("integrated", "command"), [(True, np.ones((5, 1))), (False, None)])
+def test_the_filter_is_judged_by_positions_in_a_known_loop_only(monkeypatch, integrated, command):
+    """Else the measured motion, or a simulation that drifts, would be taken for what the filter leaves."""
+    monkeypatch.setattr(gap, "simulated", lambda machine, log: SimpleNamespace(command=command))
+    run = SimpleNamespace(
+        machine=lambda machine: machine,
+        log=SimpleNamespace(measured=(True,), integrated=integrated),
+        data=SimpleNamespace(q=np.zeros((5, 1))),
+    )
+    np.testing.assert_array_equal(gap.filter_floor(None, run), [0.0])
