@@ -41,6 +41,8 @@ _FIRST, _FAR_MORE = 100, 5.0
 _MOVING = 0.2
 # A joint stands still if its first so many readings are within so many times their noise of the first one.
 _STANDS, _APART = 5, 5.0
+# Part of the travel of a joint that the least visible motion may be, so that readings show whether it stands.
+_OF_TRAVEL = 0.05
 # Factor by which a band-limited command is upsampled before its samples are joined by lines.
 _REFINE = 8
 
@@ -317,10 +319,14 @@ def with_fitted_start(replay: Replay, plant: Plant, log: Log, samples: int = 100
 
 
 def stands_still(log: Log) -> bool:
-    """Check that no joint with an encoder moves in the first samples of a log."""
+    """Check that no joint with an encoder moves in the first samples of a log.
+
+    Noise may hide motion: readings say that a joint stands only if their noise is small beside its travel.
+    """
     readings = log.readings[:, list(log.measured)]
-    away = np.abs(readings[:_STANDS] - readings[0])
-    return bool(not log.integrated and np.all(away <= _APART * signals.high_band_std(readings)))
+    away, least = np.abs(readings[:_STANDS] - readings[0]), _APART * signals.high_band_std(readings)
+    shows = least <= _OF_TRAVEL * np.ptp(readings, axis=0)
+    return bool(not log.integrated and np.all(shows) and np.all(away <= least))
 
 
 @kept_jit

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxid.logs.log import Log
-from jaxid.simulation.replay import local_line
+from jaxid.simulation.replay import local_line, stands_still
 
 PERIOD, SPEED, NOISE = 1e-3, 0.05, 1e-6
 TIME = PERIOD * np.arange(400)
@@ -32,3 +32,15 @@ def test_a_parabola_is_read_exactly_also_at_the_ends(k):
     position, velocity = local_line(log(0.3 + SPEED * TIME - 2.0 * TIME**2), k)
     assert position[0] == pytest.approx(0.3 + SPEED * TIME[k] - 2.0 * TIME[k] ** 2, rel=1e-12)
     assert velocity[0] == pytest.approx(SPEED - 4.0 * TIME[k], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("speed", "noise", "stands"),
+    [(0.0, 1e-5, True), (0.5, 1e-5, False), (0.5, 0.2, False), (0.0, 0.2, False)],
+)
+def test_a_log_begins_at_rest_only_if_its_noise_would_show_motion(speed, noise, stands):
+    """A joint that waits or moves for 0.1 s, then swings by a metre."""
+    time = 0.01 * np.arange(400)
+    path = speed * time + 0.5 * np.where(time > 0.1, 1.0 - np.cos(3.0 * (time - 0.1)), 0.0)
+    read = path + noise * np.random.default_rng(4).standard_normal(400)
+    assert stands_still(Log(time=time, position=read[:, None], force=0.0 * read[:, None])) is stands
