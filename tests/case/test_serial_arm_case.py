@@ -186,6 +186,7 @@ def on_shaft(inertia: str, viscous: str, coulomb: str) -> str:
     return "".join(f'[[effects]]\nkind = "{k}"\nshaft = 1\n{name} = {v}\n' for k, name, v in values)
 
 
+@pytest.mark.slow
 def test_friction_of_a_shaft_is_told_from_that_of_its_joints(tmp_path):
     arm = dataclasses.replace(TwoLinks(), shaft=(0.7, 1.6, 0.1))
     log = write_csv(tmp_path / "log.csv", followed(arm))

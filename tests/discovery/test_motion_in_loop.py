@@ -35,6 +35,7 @@ def spring(tmp_path_factory):
         return jaxid.discover(case, logs[0], validate=logs[1:], refit=False)
 
 
+@pytest.mark.slow
 def test_the_effect_that_worsens_the_simulation_makes_room_for_the_right_one(spring):
     assert spring.kinds == ["linear_stiffness"]
     before, after = spring.gaps_before, spring.gaps_after
@@ -42,6 +43,7 @@ def test_the_effect_that_worsens_the_simulation_makes_room_for_the_right_one(spr
         assert new.simulation.relative[0] < 0.3 * old.simulation.relative[0]
 
 
+@pytest.mark.slow
 def test_the_steps_and_the_notes_say_what_was_taken_out(spring, tmp_path):
     (out,) = [r.step for r in spring.rounds if r.step.why]
     assert out.dropped.kind == "saturation"

@@ -16,7 +16,7 @@ from truth.axis.cases import case_text, write_case
 from truth.axis.hidden_effects import AT_REST, COULOMB, PAIRS, SEARCH_CASES, VISCOUS, SearchCase
 
 # Cogging is searched for by the notebook of the first tour, with the quick tests too.
-FAST = ("coulomb_friction", "static_friction", "input_delay", "hysteresis")
+FAST = ("coulomb_friction", "input_delay", "hysteresis")
 
 
 def kinds_to_test():
@@ -138,6 +138,7 @@ def unlogged(**changes):
     return dataclasses.replace(setup, machine=machine)
 
 
+@pytest.mark.slow
 def test_unlogged_bursts_are_unexplained(tmp_path):
     bursts = machines.random_bursts(11.0, 6, 0.05, 25.0, seed=2)
     setup = unlogged(bursts=bursts)

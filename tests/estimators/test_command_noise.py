@@ -107,6 +107,7 @@ def test_a_shift_that_bends_far_is_taken_for_a_line():
     assert line == pytest.approx(LINE + far, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_what_a_correction_leaves_open_widens_the_standard_deviations(tmp_path, monkeypatch):
     """With extrapolations to once and to forty times the shift their distance is part of every interval."""
     text, log, _ = MACHINES["axis"](63, "open", "not stated")

@@ -83,6 +83,7 @@ def test_a_log_cut_into_segments_is_said_to_have_small_deviations(tmp_path):
     assert any("the standard deviations are too small" in note for note in fit.notes)
 
 
+@pytest.mark.slow
 def test_the_noise_of_a_force_that_the_law_explains_falls_below_the_floors_before(tmp_path):
     """At those floors 98.7 % of 600 intervals held, because the standard deviations were too large."""
     noise = []

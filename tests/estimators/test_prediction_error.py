@@ -230,6 +230,7 @@ def test_innovations_of_a_complete_model_are_white_and_of_another_not(fits, tmp_
     assert any("not white" in note and "Hz" in note for note in bare.notes)
 
 
+@pytest.mark.slow
 def test_noise_of_the_command_does_not_bias_the_inertia(tmp_path):
     # Noise of a fifth of the command: without the correction the mean is 3.4 deviations too large.
     noise = {"force_noise": 0.6, "position_noise": 1e-7}

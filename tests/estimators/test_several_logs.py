@@ -15,10 +15,17 @@ from jaxid.session import open_session
 from tests.support.several_logs import LOADED, axis_case, axis_log, axis_setup, write_log
 
 TRUE = np.array([95.1, 203.5, 20.39])
+
+
+def slow(*methods: str) -> list:
+    return [pytest.param(method, marks=pytest.mark.slow) for method in methods]
+
+
+# Each of these has a quick test below; the others take longer.
 METHODS = ("inverse_dynamics", "output_error", "prediction_error")
-# These take longer; one quick test of several logs runs two of them.
+QUICK = METHODS[:2]
 SLOWER = ("instrumental_variable", "didim", "within_prior", "recursive")
-SLOW = [pytest.param(method, marks=pytest.mark.slow) for method in SLOWER]
+SLOW = slow(*SLOWER)
 LOOPED = ("output_error", "instrumental_variable", "didim", "within_prior")
 
 
@@ -33,9 +40,7 @@ def logs() -> list[Log]:
     return [axis_log(seed) for seed in range(1, 5)]
 
 
-@pytest.mark.parametrize(
-    "method", [*METHODS, pytest.param("algebraic", marks=pytest.mark.slow), "power", *SLOW]
-)
+@pytest.mark.parametrize("method", [*QUICK, *slow("prediction_error", "algebraic", "power"), *SLOW])
 def test_the_deviation_of_n_equal_logs_falls_as_one_over_the_root_of_n(method, logs):
     case = case_of(method)
     one, four = (jaxid.identify(case, logs[:n], method=method).estimate for n in (1, 4))
@@ -50,7 +55,9 @@ def test_the_deviation_of_n_equal_logs_falls_as_one_over_the_root_of_n(method, l
     assert one.std / four.std == pytest.approx(np.full(3, 2.0), rel=0.2)
 
 
-@pytest.mark.parametrize("method", [*METHODS, "instrumental_variable", "recursive", *SLOW[1:3]])
+@pytest.mark.parametrize(
+    "method", [*QUICK, "instrumental_variable", "recursive", *slow("prediction_error"), *SLOW[1:3]]
+)
 def test_a_log_counts_by_its_information(method):
     # The long log has ten times the noise of the short one.
     seconds = (1.5, 2.5) if method in LOOPED and method in SLOWER else (2.0, 6.0)

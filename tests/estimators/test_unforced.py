@@ -96,6 +96,7 @@ def test_guesses_five_times_off_lead_to_the_same_optimum():
         assert abs(found.value - true) < 4 * found.std, name
 
 
+@pytest.mark.slow
 def test_without_anything_known_the_ratios_stand_and_no_absolute_value(tmp_path):
     result = identify(FREE, log())
     result.save(tmp_path)

@@ -161,6 +161,7 @@ def test_friction_that_differs_by_direction_is_found_on_emps(emps):
     assert pulses.simulation.command_relative[0] <= 0.053
 
 
+@pytest.mark.slow
 @needs_data
 def test_emps_in_open_loop(emps):
     result = jaxid.identify(emps / "emps_open_loop.toml", emps / "DATA_EMPS.mat", method="output_error")

@@ -53,7 +53,11 @@ def velocity_log(seed, seconds=6.0, noise=0.1):
 
 
 @pytest.mark.parametrize(
-    "method", ["prediction_error", "inverse_dynamics", pytest.param("output_error", marks=pytest.mark.slow)]
+    "method",
+    [
+        "inverse_dynamics",
+        *(pytest.param(m, marks=pytest.mark.slow) for m in ("prediction_error", "output_error")),
+    ],
 )
 def test_a_log_of_velocities_gives_the_parameters(method):
     estimates = identify_many(case_of(SPEEDS), [velocity_log(seed) for seed in range(6)], method=method)
@@ -127,7 +131,7 @@ def test_a_field_table_of_steady_speeds(tmp_path, capsys):
     assert (tmp_path / "out" / "result.json").read_text().count("NaN") == 0
 
 
-@pytest.mark.parametrize("scatter", [False, True])
+@pytest.mark.parametrize("scatter", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_hidden_friction_of_a_steady_table_is_found(scatter):
     log = {**TABLE, "scatter": "s"} if scatter else TABLE
     columns = table(3, rows=24)

@@ -122,7 +122,13 @@ assert error["found"] < 0.06 and error["guess"] > 0.2, error
 }
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+# The others take four minutes together.
+QUICK = "first_tour"
+
+
+@pytest.mark.parametrize(
+    "script", [pytest.param(s, id=s.stem, marks=() if s.stem == QUICK else pytest.mark.slow) for s in SCRIPTS]
+)
 def test_the_notebook_runs(script, tmp_path, monkeypatch):
     monkeypatch.setenv("JAXID_FAST", "1")
     monkeypatch.setenv("TMPDIR", str(tmp_path))

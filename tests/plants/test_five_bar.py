@@ -98,6 +98,7 @@ def test_inverse_kinematics_is_the_working_mode(robot):
     assert np.isnan(np.asarray(plant.inverse(jnp.array([0.0, 0.9])))).all()
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_paper():
     """(34)-(37) and (40), (41), with differences of nothing: products of the closure's own derivatives."""
     robot = UNEVEN

@@ -152,6 +152,7 @@ def test_inverse_and_its_derivative(size):
     np.testing.assert_allclose(slope, -np.linalg.inv(a) @ d @ np.linalg.inv(a), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_batch_of_steps_is_each_step_alone():
     """Sliding, at rest and near a reversal: a lane does not depend on whether others leave the usual case."""
     tree, geometry, parameters, (q, qd, u) = made("arm")

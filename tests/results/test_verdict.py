@@ -65,7 +65,7 @@ def verdicts(folder, seeds, sensor, **axis):
     return out
 
 
-@pytest.mark.parametrize("sensor", [True, False])
+@pytest.mark.parametrize("sensor", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_complete_model_is_complete(tmp_path, sensor):
     for noise in (0.1, 1.0, 10.0):
         assert verdicts(tmp_path, (1, 2), sensor, noise=noise) == [True, True]

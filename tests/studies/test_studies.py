@@ -106,6 +106,7 @@ VARIED = STUDY.replace("[0.5, 1.0]", "[1.0]").replace(
 )
 
 
+@pytest.mark.slow
 def test_sampling_and_resolution_are_varied_with_each_other(tmp_path):
     study = jaxid.study(write_case(tmp_path, AXIS + VARIED), runs=4)
     table = study.table

@@ -358,6 +358,7 @@ def test_results_hold_the_directions(fitted, tmp_path):
     assert "<figcaption>Force of the drive</figcaption>" in page
 
 
+@pytest.mark.slow
 def test_many_logs_are_fitted_as_each_alone(folder, fitted):
     """And one that cannot be fitted does not keep the others from it."""
     still = logged(1)
