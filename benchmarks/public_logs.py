@@ -73,14 +73,20 @@ def run(row: Row, data: Path, folder: Path) -> dict[str, Any]:
     return record
 
 
+def numbers_of(record: dict[str, Any], key: str) -> dict[str, float]:
+    """Return a number of each unknown of a record, such as its "value" or its "std", by its name."""
+    numbers: dict[str, float] = {}
+    for name, entry in record.get("parameters", {}).items():
+        several = isinstance(entry[key], list)
+        listed = entry[key] if several else [entry[key]]
+        names = [f"{name}[{k}]" if several else name for k in range(1, len(listed) + 1)]
+        numbers |= {n: v for n, v in zip(names, listed, strict=True) if v is not None}
+    return numbers
+
+
 def printed(row: Row, record: dict[str, Any]) -> dict[str, float]:
     """Return the values of a record that the table compares."""
-    values: dict[str, float] = {}
-    for name, entry in record.get("parameters", {}).items():
-        several = isinstance(entry["value"], list)
-        listed = entry["value"] if several else [entry["value"]]
-        names = [f"{name}[{k}]" if several else name for k in range(1, len(listed) + 1)]
-        values |= {n: v for n, v in zip(names, listed, strict=True) if v is not None}
+    values = numbers_of(record, "value")
     if row.derived is not None and values:
         return dict(row.derived(values))
     return {name: values[name] for name in row.truth if name in values} if row.truth else values
@@ -91,13 +97,14 @@ def cells(row: Row, record: dict[str, Any]) -> list[str]:
     steps = [name for name in ("init", "check", "identify", "discover") if name in record]
     failed = next((name for name in steps if record[name]["status"] not in (0, 1)), None)
     ran = ", ".join(f"{name} {record[name]['seconds']:g} s" for name in steps)
-    values = printed(row, record)
+    values, std = printed(row, record), {} if row.derived is not None else numbers_of(record, "std")
     shown, off = [], []
     for name, value in values.items():
         shown.append(f"{name} {value:.4g}")
         if name in row.truth:
             part = value / row.truth[name] - 1
-            off.append(f"{100 * part:+.1f} %" + (" **wrong**" if abs(part) > WRONG else ""))
+            away = f", {abs(value - row.truth[name]) / std[name]:.1f} σ" if std.get(name) else ""
+            off.append(f"{100 * part:+.1f} %{away}" + (" **wrong**" if abs(part) > WRONG else ""))
     missing = [name for name in row.truth if name not in values and "parameters" in record]
     shown += [f"{name} not identified" for name in missing]
     if failed is not None:
@@ -123,9 +130,9 @@ def table(records: dict[str, dict[str, Any]]) -> str:
         "Written by `python -m benchmarks.public_logs`. Each log goes as it is through `jaxid init LOG`,",
         "`jaxid check case.toml LOG` and `jaxid identify case.toml LOG -o out`; if the row says so,",
         "`jaxid discover` follows. No case is edited. Known values are in the order of the results and in",
-        "the units of the case: per A, V or count if the log states no more. A value more than",
-        f"{100 * WRONG:.0f} % off stands as wrong. Times are those of two shared cores, with import and",
-        "compilation.",
+        "the units of the case: per A, V or count if the log states no more. σ is the standard deviation",
+        f"that `identify` prints. A value more than {100 * WRONG:.0f} % off stands as wrong. Times are",
+        "those of two shared cores, with import and compilation.",
         "",
         "| " + " | ".join(head) + " |",
         "|" + "---|" * len(head),
