@@ -460,7 +460,9 @@ def _where_on(
     # A parameter that joints share cannot change for one of them alone.
     alone = np.sum(search.superset.enters[:, baseline.active], axis=0) == 1
     unshared = jacobian[..., baseline.active[alone]]
-    return locate(-e, unshared, data, colour, wanted, search.superset.machine.plant)
+    machine = search.superset.machine
+    units = [machine.unit("position", joint) for joint in range(data.q.shape[1])]
+    return locate(-e, unshared, data, colour, wanted, machine.plant, units)
 
 
 def _verdict_on_none(

@@ -6,7 +6,8 @@ candidates are: on held-out blocks of time, against surrogates.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -17,6 +18,7 @@ from jaxid.discovery.noise import fit_whitener
 from jaxid.logs.prepare import Prepared
 from jaxid.model.plant import Plant
 from jaxid.numerics.coloured_noise import NoiseModel
+from jaxid.numerics.ripples import strongest_ripples
 
 # Knots of the curve, at quantiles of the variable.
 _KNOTS = 12
@@ -39,8 +41,10 @@ _NEARLY_ALL = 0.95
 # that white noise exceeds once in 10^8.
 _LINE_PART = 0.05
 _LINE_FACTOR = 25.0
-# Most intervals of time that are listed in words.
+# Most intervals of time, and most periods over the position, that are listed in words.
 _LISTED = 3
+# Quantile of the speed at which a ripple over the position must be in the band of the filter.
+_SLOW = 0.05
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,8 @@ class Where:
         clear: Whether position, elongation, velocity or time exceed that threshold.
         x, mean, low, high: The curve over the variable and its 95 % band, in units of force.
         frequency_hz: Frequency of a spectral line; None without one.
+        periods: Periods of the ripples over the position that explain more than anything else, the largest
+            one first [m or rad]; empty without one.
     """
 
     joint: int
@@ -75,6 +81,7 @@ class Where:
     low: Float[np.ndarray, " bin"]
     high: Float[np.ndarray, " bin"]
     frequency_hz: float | None = None
+    periods: tuple[float, ...] = ()
 
     @classmethod
     def in_time(cls, joint: int, region: tuple[float, float], text: str, explained: float) -> Where:
@@ -156,6 +163,7 @@ def locate(
     colour: tuple[NoiseModel, ...],
     wanted: Float[np.ndarray, "kept n"] | None = None,
     plant: Plant | None = None,
+    units: Sequence[str] = (),
 ) -> Where:
     """Find the joint and variable that explain most of a residual.
 
@@ -166,13 +174,15 @@ def locate(
         colour: Noise expected from the sensors, by joint.
         wanted: Velocity of the reference at the kept samples; None: the measured velocity.
         plant: The plant, as in `variables`.
+        units: Unit of the position by joint, for words; empty: not known.
     """
     wanted = data.at_kept(data.qd) if wanted is None else wanted
     by_joint = [
         _locate(residual[:, i], jacobian[:, i], data, colour[i], wanted[:, i], i, plant)
         for i in range(residual.shape[1])
     ]
-    return max(by_joint, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
+    place = max(by_joint, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
+    return _in_turns(place, units[place.joint - 1] if units else "(SI)")
 
 
 def _locate(
@@ -198,15 +208,54 @@ def _locate(
     line, part = _spectral_line(_unexplained(sensors, e, jacobian), sensors, data, wanted)
     # A line or intervals are named only if they explain more than position or velocity do.
     line = line if part > explained else None
+    periods, share = _ripples(e, counts, data, joint)
+    periods = periods if share > max(explained, part) else ()
 
     # A curve over the motion is more informative than the times at which it is far from zero.
     over_motion = clear and not clean.startswith("time")
     needed = min(_CURVE_FACTOR * explained, _NEARLY_ALL) if over_motion else explained
-    if line is not None or _share_inside(e, counts, data, intervals) > max(needed, _MOSTLY):
+    if periods:
+        best, line = "position", None
+    elif line is not None or _share_inside(e, counts, data, intervals) > max(needed, _MOSTLY):
         best = "time"
     else:
         best = _best(gains, clean)
-    return _describe(e, counts, named[best], best, joint, gains[best], limit, clear, intervals, line)
+    found = _describe(e, counts, named[best], best, joint, gains[best], limit, clear, intervals, line)
+    return replace(found, periods=periods)
+
+
+def _in_turns(where: Where, unit: str) -> Where:
+    """Return a place with its ripples in words, if it has any."""
+    if not where.periods:
+        return where
+    every = " and ".join(f"{p:.4g} {unit}".strip() for p in where.periods)
+    turns = " and ".join(f"{2 * np.pi / p:.4g}" for p in where.periods)
+    times = f" ({turns} times a turn)" if unit == "rad" else ""
+    text = (
+        f"joint {where.joint}: the residual repeats over the position, every {every}{times}, as a ripple does"
+    )
+    return replace(where, text=text)
+
+
+def _ripples(
+    e: np.ndarray, counts: np.ndarray, data: Prepared, joint: int
+) -> tuple[tuple[float, ...], float]:
+    """Find ripples over the position in a residual: their periods, and the part of the variance they carry.
+
+    Each must stand out, and carry as large a part, as a spectral line.
+    """
+    speed = np.abs(data.at_kept(data.qd)[counts, joint])
+    if len(speed) < 100:
+        return (), 0.0
+
+    band = data.recipe.band_hz(1.0 / data.period)
+    most = band / max(float(np.quantile(speed, _SLOW)), 1e-300)
+    position, left = data.at_kept(data.q)[counts, joint], e[counts] - np.mean(e[counts])
+    found = strongest_ripples(position, left, most, _LISTED)
+    parts = 0.5 * found[:, 0] ** 2 / np.mean(left**2)
+    clear = (found[:, 3] ** 2 > _LINE_FACTOR) & (parts > _LINE_PART)
+    order = np.argsort(-parts[clear])[:_LISTED]
+    return tuple(found[clear, 1][order].tolist()), float(np.sum(parts[clear][order]))
 
 
 def _gains(

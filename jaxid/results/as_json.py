@@ -328,6 +328,7 @@ def where_json(result: Discovery) -> dict[str, Any] | None:
         "intervals": [list(i) for i in w.intervals],
         "text": w.text,
         "frequency_hz": w.frequency_hz,
+        "periods": list(w.periods),
     }
 
 

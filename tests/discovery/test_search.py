@@ -88,6 +88,8 @@ def test_the_missing_effect_is_found(kind, tmp_path):
     assert kind in named
     assert d.kinds[0] in {kind, *case.also}
     assert kind in AT_REST or closed(d) >= 0.9
+    ripples = [case.values["period"]] if kind == "cogging" else []
+    assert d.where.periods == pytest.approx(ripples, rel=0.01)
     assert any("found at the starts from rest" in note for note in d.after.notes) == (
         kind == "static_friction"
     )

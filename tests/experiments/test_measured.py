@@ -215,3 +215,20 @@ def test_an_arm_without_a_file_is_an_mjcf_with_its_torques(tmp_path):
     assert replay.before is None
     assert replay.difference.max() < 1e-3
     assert "your file" not in str(replay)
+
+
+@needs_data
+@pytest.mark.slow
+def test_the_ripples_of_a_motor_are_where_its_model_fails(tmp_path):
+    """A motor at a steady speed, whose poles and slots repeat 12, 18 and 72 times a turn.
+
+    No single effect explains them: each closes a small part of the gap, and passes for coloured noise.
+    """
+    log = Path(DATA) / "odri_motor" / "speed_test1.csv"
+    case = tmp_path / "case.toml"
+    case.write_text(jaxid.init(log).text)
+    found = jaxid.discover(case, log, refit=False, experiments=False)
+    assert (found.verdict, found.kinds, found.model_complete) == ("unexplained", [], False)
+    turns = sorted(2 * np.pi / np.array(found.where.periods))
+    assert turns == pytest.approx([12, 18], rel=2e-3)
+    assert "(18 and 12 times a turn)" in found.where.text

@@ -251,9 +251,9 @@ def where_lines(data: ReportData) -> dict | None:
 
 
 def where_region(data: ReportData) -> Sequence[float] | None:
-    """Return the range in which the residual is largest; None for a line in its spectrum."""
+    """Return the range in which the residual is largest; None for a line in its spectrum, or a ripple."""
     where = data.where or {}
-    return None if is_number(where.get("frequency_hz")) else where.get("region")
+    return None if is_number(where.get("frequency_hz")) or where.get("periods") else where.get("region")
 
 
 def step_lines(data: ReportData) -> list[dict]:
