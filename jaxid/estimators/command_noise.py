@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import numpy as np
@@ -17,6 +17,7 @@ from jaxid.estimators.joint_likelihood import (
     gradients_together,
     scored_at,
 )
+from jaxid.logs.prepare import choose_recipe, prepare
 from jaxid.numerics.bounds import presses
 from jaxid.numerics.lanes import Steps
 from jaxid.numerics.precision import Precision
@@ -29,6 +30,9 @@ _BLIND = 1e-10
 _BENT = 0.1
 # A value this near to a bound, on the scale of the solver, rests there.
 _AT_BOUND = 1e-9
+# A correction that changes a value by more than this part of it must leave the measured force as well
+# explained: it may raise the RMS of what the values leave by this factor.
+_LARGE, _WORSE = 0.02, 1.1
 # Widening of standard deviations by an uncertain correction from which on a note says so.
 _DOUBTFUL = 1.2
 
@@ -42,11 +46,13 @@ class Corrected:
         reads: Noise of each log for which they were corrected, (m,).
         doubt: Difference between two extrapolations to no noise, where the shifts do not decide between them,
             (p,).
+        refused: Reason for which they were not corrected, as a note; empty: they were.
     """
 
     theta: Float[np.ndarray, " p"]
     reads: list[np.ndarray]
     doubt: Float[np.ndarray, " p"]
+    refused: str = ""
 
     def widened(self, precision: Precision) -> Precision:
         """Return a precision by the likelihood, widened by what is not known of the correction."""
@@ -63,7 +69,7 @@ class Corrected:
         std = precision.std[known]
         moved = np.max(np.abs(self.theta - fitted)[known] / std, initial=0.0)
         factor = np.max(self.widened(precision).std[known] / std, initial=1.0)
-        notes = []
+        notes = [self.refused] if self.refused else []
         if moved > 1:
             notes.append(
                 "noise with which the command was read had moved a value by "
@@ -122,9 +128,39 @@ def corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[Corrected]:
 
     line, parabola, bent = extrapolations(half, whole)
     by_line, by_parabola = without(line), without(parabola)
-    if bent:
-        return Corrected(by_line, reads, np.abs(by_parabola - by_line))
-    return Corrected(by_parabola, reads, as_it_is.doubt)
+    found = by_line if bent else by_parabola
+    before, after = force_left(fit, end.theta, found)
+    if after > _WORSE * before:
+        note = (
+            "the values were not corrected for noise with which the command was read: corrected ones would "
+            f"leave {after / before:.3g} times as much of the measured force, so that not all of what counts "
+            "as this noise is noise"
+        )
+        return replace(as_it_is, refused=note)
+    return Corrected(found, reads, np.abs(by_parabola - by_line) if bent else as_it_is.doubt)
+
+
+def force_left(
+    fit: JointLikelihood, fitted: Float[np.ndarray, " p"], corrected: Float[np.ndarray, " p"]
+) -> tuple[float, float]:
+    """Return the RMS of the measured force that values leave before and after a correction, over all logs.
+
+    Least squares of the force is without the bias: the noise is in what it explains, not in its regressors.
+    Both are zero where the correction is small, or where some joints have no encoder.
+    """
+    from jaxid.gap import force_gap
+
+    logs = [member.part for member in fit.members]
+    large = np.any(np.abs(corrected - fitted) > _LARGE * np.abs(fitted))
+    if not large or not all(all(part.log.measured) for part in logs):
+        return 0.0, 0.0
+    squares = np.zeros(2)
+    for part in logs:
+        data = part.prepared or prepare(part.log, part.machine.gain, choose_recipe(part.log))
+        for k, theta in enumerate((fitted, corrected)):
+            squares[k] += np.nansum(force_gap(part.at(theta), data).rms ** 2)
+    before, after = np.sqrt(squares)
+    return float(before), float(after)
 
 
 def extrapolations(

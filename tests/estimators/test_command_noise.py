@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ import scipy.optimize
 import jaxid
 from benchmarks.interval_machines import MACHINES
 from jaxid.estimators import command_noise
-from jaxid.estimators.command_noise import Shift, extrapolations
+from jaxid.estimators.command_noise import Shift, extrapolations, force_left
 from jaxid.estimators.innovations import fit_steps
 from jaxid.estimators.likelihood import likelihood_of
+from jaxid.estimators.several.parts import parts_of
+from jaxid.gap import force_gap
 from jaxid.session import open_session
 from jaxid.simulation.noisy_loop import _levels_beside
 
@@ -113,6 +116,8 @@ def test_what_a_correction_leaves_open_widens_the_standard_deviations(tmp_path, 
     text, log, _ = MACHINES["axis"](63, "open", "not stated")
     path = tmp_path / "case.toml"
     path.write_text(text)
+    # Forty times the shift would leave more of the measured force.
+    monkeypatch.setattr(command_noise, "force_left", lambda *args: (0.0, 0.0))
 
     def fit(times: float, bent: bool, hessian: bool = False):
         taken = lambda half, whole: (whole.step, times * whole.step, bent)
@@ -130,6 +135,56 @@ def test_what_a_correction_leaves_open_widens_the_standard_deviations(tmp_path, 
 
     curved, sure = fit(40.0, True, hessian=True), fit(1.0, False, hessian=True)
     assert curved.std == pytest.approx(np.hypot(sure.std, distance), rel=1e-3)
+
+
+def test_the_force_that_a_large_correction_leaves_is_compared(tmp_path):
+    text, log, true = MACHINES["axis"](63, "open", "not stated")
+    path = tmp_path / "case.toml"
+    path.write_text(text)
+    session = open_session(path, log)
+    fit = SimpleNamespace(members=[SimpleNamespace(part=part) for part in parts_of(session)])
+    theta = np.array([true[name] for name in session.machine.parameters.names])
+
+    gap = force_gap(session.machine.with_estimate(theta), session.fit.data).rms[0]
+    before, after = force_left(fit, theta, 1.5 * theta)
+    assert before == pytest.approx(gap, rel=1e-12)
+    assert after > 3.0 * before
+    assert force_left(fit, 1.5 * theta, theta) == (after, before)
+    assert force_left(fit, theta, 1.01 * theta) == (0.0, 0.0)
+
+
+@pytest.mark.slow
+def test_a_correction_that_explains_the_force_worse_is_not_made(tmp_path, monkeypatch):
+    text, log, _ = MACHINES["axis"](63, "open", "not stated")
+    path = tmp_path / "case.toml"
+    path.write_text(text)
+    fit = lambda: jaxid.identify(path, log, method="prediction_error").estimate
+
+    monkeypatch.setattr(
+        command_noise, "extrapolations", lambda half, whole: (1e4 * whole.step,) * 2 + (False,)
+    )
+    refused = fit()
+    monkeypatch.setattr(command_noise, "_noise_of_reading", lambda member, x: np.zeros(member.drives))
+    as_it_is = fit()
+    assert refused.theta == pytest.approx(as_it_is.theta, rel=1e-12)
+    assert refused.std == pytest.approx(as_it_is.std, rel=1e-12)
+    [note] = set(refused.notes) - set(as_it_is.notes)
+    assert note.startswith("the values were not corrected for noise with which the command was read")
+
+
+@pytest.mark.skipif(not MEASURED, reason="JAXID_DATA is not set: no measured logs")
+@pytest.mark.slow
+def test_pulses_of_a_command_are_no_noise(tmp_path):
+    """The correction for them had taken the viscous friction to zero, and doubled the other."""
+    log = Path(MEASURED) / "emps" / "DATA_EMPS_PULSES.mat"
+    case = tmp_path / "case.toml"
+    case.write_text(jaxid.init(log).text)
+    fit = jaxid.identify(case, log, method="prediction_error")
+    # Published values in N, over the gain of the drive.
+    published = {"inertia": 95.109, "viscous_friction.coefficient": 203.50, "coulomb_friction.level": 20.39}
+    for name, value in published.items():
+        assert abs(fit.value(name) - value / 35.15065) < 2.5 * fit.parameters[name].std, name
+        assert fit.value(name) == pytest.approx(value / 35.15065, rel=0.1), name
 
 
 @pytest.mark.parametrize(("machine", "least"), [("axis", 4), ("flexible_axis", 8)])
