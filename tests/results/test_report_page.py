@@ -87,6 +87,26 @@ def test_what_was_found_stands_in_the_chain_and_in_words(found):
     assert page.index("What was found") < page.index("The drive chain") < page.index("This run")
 
 
+def test_a_ripple_is_drawn_over_the_position_folded_at_its_period(found):
+    data = discovery_data(found)
+    where = {"joint": 1, "text": "joint 1: the residual repeats", "periods": [0.0125, 0.3]}
+    page = render(replace(data, where={**data.where, **where}))
+    assert "Before and after: force residual over position, folded at 0.0125 m" in words(page)
+    # A figure of the log has it over the whole position.
+    assert ': force residual over position"' in page
+    elsewhere = words(render(replace(data, where={**data.where, **where, "joint": 2})))
+    assert "folded at" not in elsewhere
+
+
+def test_the_place_of_an_unexplained_residual_is_said_first(found):
+    data = discovery_data(found)
+    where = {**data.where, "text": "joint 1: the residual repeats over the position"}
+    sentence = "Joint 1: the residual repeats over the position."
+    page = words(render(replace(data, where=where, verdict="unexplained")))
+    assert page.index(sentence) < page.index("The drive chain")
+    assert sentence not in words(render(replace(data, where=where)))
+
+
 def test_effects_of_one_kind_at_many_joints_are_one_entry(found):
     data = discovery_data(found)
     [one] = data.effects

@@ -6,8 +6,10 @@ import base64
 import io
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import resources
 
+import numpy as np
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -55,7 +57,7 @@ def render(data: ReportData) -> str:
         verdict_class=tables.verdict_class(data),
         completeness=first_page.completeness(data),
         answer=tables.answer(data),
-        findings=[tables.unbroken(finding) for finding in data.findings[1:]],
+        findings=[tables.unbroken(finding) for finding in (*_place(data), *data.findings[1:])],
         found=first_page.found_entries(data),
         telling=telling,
         friction=_friction(data),
@@ -103,6 +105,12 @@ def filled(template: str, **entries: object) -> str:
     return environment.get_template(template).render(**common, **entries)
 
 
+def _place(data: ReportData) -> list[str]:
+    """Return where an unexplained residual lies, as a sentence; of what was found the effects tell it."""
+    text = (data.where or {}).get("text")
+    return [f"{text[0].upper()}{text[1:]}."] if text and data.verdict == "unexplained" else []
+
+
 def _telling(data: ReportData, main: int | None) -> dict | None:
     """Return the figure that convinces: the residual over the variable that it follows most, or positions."""
     if main is None:
@@ -125,14 +133,27 @@ def _telling(data: ReportData, main: int | None) -> dict | None:
         if size == _LOW:
             return {"title": title, "variable": "forces"} | _picture(words, plot_forces, view, units)
         return {"title": title, "variable": None} | image(plot_forces(view, units, size=size), words)
+    period = _period(data, view)
+    within = ""
+    if period is not None:
+        # Over a stroke of hundreds of periods nothing is seen; within one the samples lie on the ripple.
+        view, variable = replace(view, position=np.mod(view.position, period)), "position"
+        within = f", folded at {short(period, 4)} {pretty_unit(units['position'])}"
     figure = plots.plot_residual_against(view, units, variables=(variable,), size=size)
-    title = f"{'Before and after: force' if both else 'Force'} residual over {variable}"
+    title = f"{'Before and after: force' if both else 'Force'} residual over {variable}{within}"
     title += f" ({view.name})" if len(data.views) > 1 else ""
-    drawn = image(figure, f"{view.name}: force residual over {variable}")
+    drawn = image(figure, f"{view.name}: force residual over {variable}{within}")
     if size == _LOW:
         narrow = plots.plot_residual_against(view, units, variables=(variable,))
         drawn = with_narrow(drawn, narrow)
-    return {"title": title, "variable": variable} | drawn
+    return {"title": title, "variable": None if within else variable} | drawn
+
+
+def _period(data: ReportData, view: LogView) -> float | None:
+    """Return the period of the largest ripple that a search saw in the residual of a log's joint."""
+    where = data.where or {}
+    periods = where.get("periods") or []
+    return periods[0] if periods and where.get("joint") == view.joint + 1 and not view.steady else None
 
 
 def _beside(entry: dict, telling: dict | None) -> dict | None:
