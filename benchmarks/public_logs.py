@@ -49,11 +49,14 @@ def run(row: Row, data: Path, folder: Path) -> dict[str, Any]:
     case = folder / "case.toml"
     record: dict[str, Any] = {"file": row.file}
 
+    def without_path(text: str) -> str:
+        return text.replace(str(log), log.name).replace(f"{data}/", "")
+
     def step(name: str, *words: object) -> bool:
         status, said, seconds = command(*words)
         record[name] = {"status": status, "seconds": round(seconds, 1)}
         if status not in (0, 1):
-            record[name]["said"] = said.replace(str(log), log.name).replace(f"{data}/", "")
+            record[name]["said"] = without_path(said)
         return status in (0, 1)
 
     if not step("init", "init", log, "-o", case):
@@ -66,10 +69,11 @@ def run(row: Row, data: Path, folder: Path) -> dict[str, Any]:
     if step("identify", "identify", case, log, "-o", folder / "fit"):
         result = json.loads((folder / "fit/result.json").read_text())
         record |= {key: result[key] for key in ("method", "converged", "parameters", "model_complete", "gap")}
+        record["first_words"] = without_path(result["findings"][0]) if result["findings"] else None
     if row.search and step("discover", "discover", case, log, "-o", folder / "found", "--no-experiments"):
         found = json.loads((folder / "found/discovery.json").read_text())
         record |= {"verdict": found["verdict"], "found": [e["kind"] for e in found["effects"]]}
-        record["parameters_found"] = found["parameters"]
+        record |= {"parameters_found": found["parameters"], "where": (found["where"] or {}).get("text")}
     return record
 
 
@@ -111,10 +115,14 @@ def cells(row: Row, record: dict[str, Any]) -> list[str]:
         shown.append(f"`{failed}` refuses: {record[failed]['said']}")
     if "parameters" in record and not record["converged"]:
         shown.append("not converged")
-    if record.get("model_complete") is False:
+    if record.get("first_words") and (any("wrong" in o for o in off) or not record.get("model_complete")):
+        shown.append(f"first words: {record['first_words']}")
+    elif record.get("model_complete") is False:
         shown.append("the model is said to be incomplete")
     if "verdict" in record:
         shown.append(f"discover: {record['verdict'].replace('_', ' ')} {', '.join(record['found'])}".rstrip())
+        if record["verdict"] == "unexplained" and record.get("where"):
+            shown.append(record["where"])
     truth = ", ".join(f"{value:.4g}" for value in row.truth.values()) or "-"
     cells = [row.file, ran, "<br>".join(shown), truth, "<br>".join(off) or "-", row.of]
     return [*cells, record.get("commit", ""), record.get("date", "")]

@@ -99,7 +99,12 @@ ROWS = (
     Row("field/velocity_only.csv", FEEDFORWARD, SIMULATED),
     Row("field/velocity_table.csv", {}, "not stated"),
     Row("field/wrapped.csv", friction(6e-4, 1.2e-3, 0.008), SIMULATED),
-    Row("odri_motor/speed_test1.csv", {"inertia": 1.97e-4}, "least squares with the ripple as a column"),
+    Row(
+        "odri_motor/speed_test1.csv",
+        {"inertia": 1.97e-4},
+        "least squares with the ripple as a column",
+        search=True,
+    ),
     Row("odri_motor/acc_current.csv", {}, "not published"),
     Row("dfki_pendulum/pd.csv", DFKI, "fit of a simulation by scipy", search=True),
     Row("dfki_pendulum/swingup_1nm.csv", DFKI, "fit of a simulation by scipy, of pd.csv"),
