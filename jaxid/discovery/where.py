@@ -43,6 +43,8 @@ _LINE_PART = 0.05
 _LINE_FACTOR = 25.0
 # Most intervals of time, and most periods over the position, that are listed in words.
 _LISTED = 3
+# Least number of periods in the stroke: a smooth force over the position looks like fewer.
+_TURNS = 3
 # Quantile of the speed at which a ripple over the position must be in the band of the filter.
 _SLOW = 0.05
 
@@ -254,6 +256,7 @@ def _ripples(
     found = strongest_ripples(position, left, most, _LISTED)
     parts = 0.5 * found[:, 0] ** 2 / np.mean(left**2)
     clear = (found[:, 3] ** 2 > _LINE_FACTOR) & (parts > _LINE_PART)
+    clear &= _TURNS * found[:, 1] < np.ptp(position)
     order = np.argsort(-parts[clear])[:_LISTED]
     return tuple(found[clear, 1][order].tolist()), float(np.sum(parts[clear][order]))
 
