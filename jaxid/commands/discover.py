@@ -462,7 +462,7 @@ def _where_on(
     unshared = jacobian[..., baseline.active[alone]]
     machine = search.superset.machine
     units = [machine.unit("position", joint) for joint in range(data.q.shape[1])]
-    return locate(-e, unshared, data, colour, wanted, machine.plant, units)
+    return locate(-e, unshared, data, colour, units, wanted, machine.plant)
 
 
 def _verdict_on_none(

@@ -163,9 +163,9 @@ def locate(
     jacobian: Float[np.ndarray, "kept n p"],
     data: Prepared,
     colour: tuple[NoiseModel, ...],
+    units: Sequence[str],
     wanted: Float[np.ndarray, "kept n"] | None = None,
     plant: Plant | None = None,
-    units: Sequence[str] = (),
 ) -> Where:
     """Find the joint and variable that explain most of a residual.
 
@@ -174,17 +174,16 @@ def locate(
         jacobian: Derivatives of the residual in the model's unknowns; what these can absorb does not count.
         data: The prepared log.
         colour: Noise expected from the sensors, by joint.
+        units: Unit of the position by joint, for words.
         wanted: Velocity of the reference at the kept samples; None: the measured velocity.
         plant: The plant, as in `variables`.
-        units: Unit of the position by joint, for words; empty: not known.
     """
     wanted = data.at_kept(data.qd) if wanted is None else wanted
     by_joint = [
-        _locate(residual[:, i], jacobian[:, i], data, colour[i], wanted[:, i], i, plant)
+        _locate(residual[:, i], jacobian[:, i], data, colour[i], wanted[:, i], i, units[i], plant)
         for i in range(residual.shape[1])
     ]
-    place = max(by_joint, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
-    return _in_turns(place, units[place.joint - 1] if units else "(SI)")
+    return max(by_joint, key=lambda w: w.explained * float(np.nanvar(residual[:, w.joint - 1])))
 
 
 def _locate(
@@ -194,6 +193,7 @@ def _locate(
     colour: NoiseModel,
     wanted: np.ndarray,
     joint: int,
+    unit: str,
     plant: Plant | None,
 ) -> Where:
     """Find the variable that explains most of the residual of one joint."""
@@ -223,20 +223,7 @@ def _locate(
     else:
         best = _best(gains, clean)
     found = _describe(e, counts, named[best], best, joint, gains[best], limit, clear, intervals, line)
-    return replace(found, periods=periods)
-
-
-def _in_turns(where: Where, unit: str) -> Where:
-    """Return a place with its ripples in words, if it has any."""
-    if not where.periods:
-        return where
-    every = " and ".join(f"{p:.4g} {unit}".strip() for p in where.periods)
-    turns = " and ".join(f"{2 * np.pi / p:.4g}" for p in where.periods)
-    times = f" ({turns} times a turn)" if unit == "rad" else ""
-    text = (
-        f"joint {where.joint}: the residual repeats over the position, every {every}{times}, as a ripple does"
-    )
-    return replace(where, text=text)
+    return replace(found, periods=periods, text=_in_periods(periods, joint, unit)) if periods else found
 
 
 def _ripples(
@@ -294,6 +281,21 @@ def _best(gains: dict[str, float], clean: str) -> str:
     """Choose the variable to name: one that carries the residual's noise must explain far more."""
     other = max((n for n in _NOISY if n in gains), key=lambda n: gains[n])
     return other if gains[other] > _FAR_MORE * max(gains[clean], 0.0) else clean
+
+
+def _in_periods(periods: tuple[float, ...], joint: int, unit: str) -> str:
+    """Return ripples over the position of a joint in words."""
+    every = _listed([f"{p:.4g} {unit}" for p in periods])
+    turns = _listed([f"{2 * np.pi / p:.4g}" for p in periods])
+    times = f" ({turns} times a turn)" if unit == "rad" else ""
+    return (
+        f"joint {joint + 1}: the residual repeats over the position, every {every}{times}, as a ripple does"
+    )
+
+
+def _listed(words: Sequence[str]) -> str:
+    """Return words with commas, and with "and" before the last one."""
+    return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
 
 
 def _in_words(intervals: tuple[tuple[float, float], ...]) -> str:

@@ -184,8 +184,7 @@ def _prediction_error(
 ) -> Steps[Estimate]:
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
     from jaxid.estimators.prediction_error import prediction_error_steps
-    from jaxid.estimators.several.parts import parts_of
-    from jaxid.simulation.sensor_noise import force_noise
+    from jaxid.estimators.several.parts import Part, parts_of
 
     machine, run, demands = session.machine, session.fit, session.case.identification
     precision = {
@@ -202,11 +201,9 @@ def _prediction_error(
     return (
         yield from prediction_error_steps(
             machine,
-            run.log,
+            [Part.alone(machine, run.log, run.data)],
             start=_whole(first, machine),
             numerics=numerics,
-            rest_velocity=np.asarray(run.data.recipe.rest_velocity),
-            command_noise=force_noise(machine, run.data),
             **precision,
         )
     )

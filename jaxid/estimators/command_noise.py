@@ -17,7 +17,8 @@ from jaxid.estimators.joint_likelihood import (
     gradients_together,
     scored_at,
 )
-from jaxid.logs.prepare import choose_recipe, prepare
+from jaxid.estimators.several.parts import Part
+from jaxid.logs.prepare import Prepared, choose_recipe, prepare
 from jaxid.numerics.bounds import presses
 from jaxid.numerics.lanes import Steps
 from jaxid.numerics.precision import Precision
@@ -129,38 +130,48 @@ def corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[Corrected]:
     line, parabola, bent = extrapolations(half, whole)
     by_line, by_parabola = without(line), without(parabola)
     found = by_line if bent else by_parabola
-    before, after = force_left(fit, end.theta, found)
-    if after > _WORSE * before:
+    more = growth_of_gap(fit, end.theta, found)
+    if more > _WORSE:
         note = (
-            "the values were not corrected for noise with which the command was read: corrected ones would "
-            f"leave {after / before:.3g} times as much of the measured force, so that not all of what counts "
-            "as this noise is noise"
+            "the values were not corrected for noise with which the command was read: the corrected ones "
+            f"leave {more:.3g} times as much of the measured force, so that a part of this noise is none"
         )
         return replace(as_it_is, refused=note)
     return Corrected(found, reads, np.abs(by_parabola - by_line) if bent else as_it_is.doubt)
 
 
-def force_left(
+def growth_of_gap(
     fit: JointLikelihood, fitted: Float[np.ndarray, " p"], corrected: Float[np.ndarray, " p"]
-) -> tuple[float, float]:
-    """Return the RMS of the measured force that values leave before and after a correction, over all logs.
+) -> float:
+    """Return how many times as much of the measured force corrected values leave as fitted ones.
 
     Least squares of the force is without the bias: the noise is in what it explains, not in its regressors.
-    Both are zero where the correction is small, or where some joints have no encoder.
+
+    Args:
+        fit: The likelihood, with its logs.
+        fitted, corrected: Values of the unknowns, (p,) each.
+
+    Returns:
+        Ratio of the RMS forces over all logs, as a root mean square over the joints; one where the correction
+        is small, or where a joint has no encoder.
     """
     from jaxid.gap import force_gap
 
-    logs = [member.part for member in fit.members]
+    parts = [member.part for member in fit.members]
     large = np.any(np.abs(corrected - fitted) > _LARGE * np.abs(fitted))
-    if not large or not all(all(part.log.measured) for part in logs):
-        return 0.0, 0.0
-    squares = np.zeros(2)
-    for part in logs:
-        data = part.prepared or prepare(part.log, part.machine.gain, choose_recipe(part.log))
-        for k, theta in enumerate((fitted, corrected)):
-            squares[k] += np.nansum(force_gap(part.at(theta), data).rms ** 2)
-    before, after = np.sqrt(squares)
-    return float(before), float(after)
+    if not large or not all(all(part.log.measured) for part in parts):
+        return 1.0
+
+    squares = []
+    for theta in (fitted, corrected):
+        gaps = [force_gap(part.at(theta), part.prepared or _prepared(part)) for part in parts]
+        squares.append(sum(gap.rms**2 for gap in gaps))
+    return float(np.sqrt(np.nanmean(squares[1] / squares[0])))
+
+
+def _prepared(part: Part) -> Prepared:
+    """Filter the log of a fit that was given no session, as its noise asks."""
+    return prepare(part.log, part.machine.gain, choose_recipe(part.log), part.machine.hold_period)
 
 
 def extrapolations(

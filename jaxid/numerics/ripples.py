@@ -12,8 +12,8 @@ from jaxtyping import Float
 _BINS = 8
 # Lines of the spectrum in the width of a peak, and in the stretch whose median is the level around a peak.
 _FINE, _AROUND = 4, 201
-# Largest number of bins: a spectrum over more takes more than a second.
-_MOST = 2**21
+# Largest number of bins: a spectrum over more takes more than 0.2 s.
+_MOST = 2**18
 
 
 def strongest_ripples(

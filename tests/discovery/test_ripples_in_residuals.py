@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxid.discovery.where import _ripples
+from jaxid.discovery.where import _in_periods, _ripples
 
 TIME = 0.01 * np.arange(1500)
 POSITION = 0.1 * np.sin(2 * np.pi * 0.3 * TIME) + 0.04 * np.sin(2 * np.pi * 1.1 * TIME)
@@ -48,3 +48,19 @@ def test_ripples_are_listed_by_their_part():
 )
 def test_other_forces_are_no_ripple(force):
     assert found(force)[0] == ()
+
+
+@pytest.mark.parametrize(
+    ("periods", "unit", "words"),
+    [
+        ((0.02,), "m", "every 0.02 m, as a ripple does"),
+        (
+            (np.pi / 9, np.pi / 6),
+            "rad",
+            "every 0.3491 rad and 0.5236 rad (18 and 12 times a turn), as a ripple does",
+        ),
+        ((0.3, 0.2, 0.1), "m", "every 0.3 m, 0.2 m and 0.1 m, as a ripple does"),
+    ],
+)
+def test_periods_are_said_with_their_unit(periods, unit, words):
+    assert _in_periods(periods, 1, unit) == f"joint 2: the residual repeats over the position, {words}"

@@ -1,6 +1,7 @@
 """Extrapolation of the shift by noise of the logged command, and the steps and lanes of such fits."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,7 +12,7 @@ import scipy.optimize
 import jaxid
 from benchmarks.interval_machines import MACHINES
 from jaxid.estimators import command_noise
-from jaxid.estimators.command_noise import Shift, extrapolations, force_left
+from jaxid.estimators.command_noise import Shift, extrapolations, growth_of_gap
 from jaxid.estimators.innovations import fit_steps
 from jaxid.estimators.likelihood import likelihood_of
 from jaxid.estimators.several.parts import parts_of
@@ -117,7 +118,7 @@ def test_what_a_correction_leaves_open_widens_the_standard_deviations(tmp_path, 
     path = tmp_path / "case.toml"
     path.write_text(text)
     # Forty times the shift would leave more of the measured force.
-    monkeypatch.setattr(command_noise, "force_left", lambda *args: (0.0, 0.0))
+    monkeypatch.setattr(command_noise, "growth_of_gap", lambda *args: 1.0)
 
     def fit(times: float, bent: bool, hessian: bool = False):
         taken = lambda half, whole: (whole.step, times * whole.step, bent)
@@ -145,12 +146,14 @@ def test_the_force_that_a_large_correction_leaves_is_compared(tmp_path):
     fit = SimpleNamespace(members=[SimpleNamespace(part=part) for part in parts_of(session)])
     theta = np.array([true[name] for name in session.machine.parameters.names])
 
-    gap = force_gap(session.machine.with_estimate(theta), session.fit.data).rms[0]
-    before, after = force_left(fit, theta, 1.5 * theta)
-    assert before == pytest.approx(gap, rel=1e-12)
-    assert after > 3.0 * before
-    assert force_left(fit, 1.5 * theta, theta) == (after, before)
-    assert force_left(fit, theta, 1.01 * theta) == (0.0, 0.0)
+    left = [force_gap(session.machine.with_estimate(f * theta), session.fit.data).rms[0] for f in (1.0, 1.5)]
+    assert left[1] > 3.0 * left[0]
+    assert growth_of_gap(fit, theta, 1.5 * theta) == pytest.approx(left[1] / left[0], rel=1e-12)
+    assert growth_of_gap(fit, 1.5 * theta, theta) == pytest.approx(left[0] / left[1], rel=1e-12)
+    assert growth_of_gap(fit, theta, 1.01 * theta) == 1.0
+    # A fit without a session filters the log as its noise asks.
+    alone = SimpleNamespace(members=[SimpleNamespace(part=replace(parts_of(session)[0], prepared=None))])
+    assert growth_of_gap(alone, theta, 1.5 * theta) == pytest.approx(left[1] / left[0], rel=1e-12)
 
 
 @pytest.mark.slow

@@ -106,7 +106,7 @@ def filled(template: str, **entries: object) -> str:
 
 
 def _place(data: ReportData) -> list[str]:
-    """Return where an unexplained residual lies, as a sentence; of what was found the effects tell it."""
+    """Return where an unexplained residual lies, as a sentence. Effects that were found have their place."""
     text = (data.where or {}).get("text")
     return [f"{text[0].upper()}{text[1:]}."] if text and data.verdict == "unexplained" else []
 

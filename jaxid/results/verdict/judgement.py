@@ -129,7 +129,7 @@ def _scale_words(session: Session) -> list[str]:
     listed = ", ".join(known[:_MOST])
     return [
         f"Nothing drives the machine, so all values are in proportion to {listed}, which the log cannot "
-        "check: of an assumption only their ratios hold."
+        "check. If it is an assumption, only the ratios of the values hold."
     ]
 
 
