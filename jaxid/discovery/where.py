@@ -43,8 +43,11 @@ _LINE_PART = 0.05
 _LINE_FACTOR = 25.0
 # Most intervals of time, and most periods over the position, that are listed in words.
 _LISTED = 3
-# Least number of periods in the stroke: a smooth force over the position looks like fewer.
-_TURNS = 3
+# Least number of periods in the stroke: a smooth force over the position looks like fewer. Up to the second
+# number a ripple must carry most of the variance: a force at some places of the stroke has such lines too.
+# Of more periods it must carry this part.
+_TURNS, _MANY_TURNS = 3, 30
+_RIPPLE_PART = 0.1
 # Quantile of the speed at which a ripple over the position must be in the band of the filter.
 _SLOW = 0.05
 
@@ -231,7 +234,7 @@ def _ripples(
 ) -> tuple[tuple[float, ...], float]:
     """Find ripples over the position in a residual: their periods, and the part of the variance they carry.
 
-    Each must stand out, and carry as large a part, as a spectral line.
+    Each must stand out as a spectral line must.
     """
     speed = np.abs(data.at_kept(data.qd)[counts, joint])
     if len(speed) < 100:
@@ -242,8 +245,9 @@ def _ripples(
     position, left = data.at_kept(data.q)[counts, joint], e[counts] - np.mean(e[counts])
     found = strongest_ripples(position, left, most, _LISTED)
     parts = 0.5 * found[:, 0] ** 2 / np.mean(left**2)
-    clear = (found[:, 3] ** 2 > _LINE_FACTOR) & (parts > _LINE_PART)
-    clear &= _TURNS * found[:, 1] < np.ptp(position)
+    turns = np.ptp(position) / found[:, 1]
+    clear = (found[:, 3] ** 2 > _LINE_FACTOR) & (turns > _TURNS)
+    clear &= parts > np.where(turns < _MANY_TURNS, _MOSTLY, _RIPPLE_PART)
     order = np.argsort(-parts[clear])[:_LISTED]
     return tuple(found[clear, 1][order].tolist()), float(np.sum(parts[clear][order]))
 

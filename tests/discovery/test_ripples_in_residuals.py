@@ -26,6 +26,11 @@ def found(force: np.ndarray) -> tuple[tuple[float, ...], float]:
     return _ripples(force + NOISE, MOVING, data, 0)
 
 
+def bumps(places: list[float], heights: list[float]) -> np.ndarray:
+    """Return a force at some places of the stroke."""
+    return np.exp(-(((POSITION[:, None] - np.array(places)) / 0.012) ** 2)) @ np.array(heights)
+
+
 def test_ripples_are_listed_by_their_part():
     force = np.cos(2 * np.pi * POSITION / 0.02) + 0.5 * np.cos(2 * np.pi * POSITION / 0.007 + 1.0)
     periods, part = found(force)
@@ -43,8 +48,20 @@ def test_ripples_are_listed_by_their_part():
         np.sign(VELOCITY),
         VELOCITY,
         np.cos(2 * np.pi * POSITION / 0.15),
+        bumps([-0.07, 0.0, 0.05], [1.0, -1.0, 1.0]),
+        bumps([-0.06, 0.0, 0.06], [3.0, 3.0, 3.0]),
     ],
-    ids=["noise", "spring", "bent spring", "clock", "dry friction", "damper", "two periods"],
+    ids=[
+        "noise",
+        "spring",
+        "bent spring",
+        "clock",
+        "dry friction",
+        "damper",
+        "two periods",
+        "three places",
+        "three alike",
+    ],
 )
 def test_other_forces_are_no_ripple(force):
     assert found(force)[0] == ()
