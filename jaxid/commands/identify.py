@@ -20,6 +20,7 @@ from jaxid.estimators.common.minimisers import Minimiser, minimiser_name, minimi
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.force_course import with_force_course
 from jaxid.estimators.loop_noise import with_loop_noise
 from jaxid.estimators.needs import refuse_without_likelihood
 from jaxid.gap import Gap, gaps, noise_floor
@@ -132,7 +133,7 @@ def identify(
         method = choice.method
 
     progress(f"fitting by {method}")
-    estimate = run_alone(_tested(method, session, options), _gaps_of(session))
+    session, estimate = run_alone(_tested(method, session, options), _gaps_of(session))
     if choice is not None:
         estimate = with_choice(estimate, choice)
     progress("simulating")
@@ -179,10 +180,9 @@ def identify_many(
 
     def steps(case: Case, log: LogLike) -> Steps[Estimate]:
         session = open_session(case, log, method=method)
-        if method is not None:
-            return (yield from _tested(method, session, {}))
-        choice = choose_method(session)
-        return with_choice((yield from _tested(choice.method, session, {})), choice)
+        choice = None if method is not None else choose_method(session)
+        _, estimate = yield from _tested(method if choice is None else choice.method, session, {})
+        return estimate if choice is None else with_choice(estimate, choice)
 
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
 
@@ -220,13 +220,17 @@ def _checked_options(
     return options
 
 
-def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[Estimate]:
-    """Fit by a method; beside inverse dynamics, test whether noise in a known loop biases it."""
+def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[tuple[Session, Estimate]]:
+    """Fit by a method, and test what it assumed: the course of the force, and a loop without noise.
+
+    Returns:
+        The session under the course of the force that the fit chose, and the fit.
+    """
     more = {"scaled": True} if method == "output_error" else {}
     estimate = yield from steps_of(method, session, **options, **more)
     if method != "inverse_dynamics" or session.more:
-        return estimate
-    return (yield from with_loop_noise(session, estimate))
+        return (yield from with_force_course(session, method, estimate, options))
+    return session, (yield from with_loop_noise(session, estimate))
 
 
 def _piecewise(case: Case, method: str | None, options: Collection[str]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,8 +23,11 @@ _CLEARLY = 0.9
 # reversal alone, which a model may meet by chance, is no evidence.
 _STRETCHES = 20
 _SURE = 2.0
-# Smallest gain in log-likelihood, over the samples with independent residuals.
-_EVIDENCE = 12.0
+# Beginning of the note that a hold was chosen.
+_CHOSEN = "hold is not stated"
+# Smallest gain in log-likelihood, over the samples with independent residuals; also that of one course of the
+# force over another one.
+EVIDENCE = 12.0
 
 
 def better_hold(
@@ -102,7 +106,7 @@ def clearly_smaller(
     error = np.std(gain, ddof=1) / np.sqrt(len(gain))
     total = np.sqrt(less.sum() / max(more.sum(), 1e-300))
     evidence = -_independent(residual, counts) * np.log(max(total, 1e-300))
-    return bool(np.mean(gain) > _SURE * error and total < _CLEARLY and evidence > _EVIDENCE)
+    return bool(np.mean(gain) > _SURE * error and total < _CLEARLY and evidence > EVIDENCE)
 
 
 def _independent(residual: np.ndarray, counts: np.ndarray) -> float:
@@ -138,7 +142,7 @@ def hold_finding(log: Log, other: str, gaps: np.ndarray, unit: str, *, used: boo
     """
     sizes = f"leaves a force gap of {gaps[1]:.3g} {unit}, '{log.hold}' {gaps[0]:.3g} {unit}"
     if used:
-        what = f"hold is not stated, and '{other}' is used: it {sizes}"
+        what = f"{_CHOSEN}, and '{other}' is used: it {sizes}"
         hint = f"state hold = '{other}' in [log] to confirm it, or hold = '{log.hold}'"
     else:
         what = f"hold = '{log.hold}' is stated, but '{other}' {sizes}"
@@ -146,6 +150,23 @@ def hold_finding(log: Log, other: str, gaps: np.ndarray, unit: str, *, used: boo
         if other == "zero_order":
             hint = f"set hold = '{other}' in [log] if each force is held until the next sample"
     return Finding("warning", what, f"{log.source}, force", hint)
+
+
+def under_smooth_force(
+    findings: Sequence[Finding], reason: str, gain: float
+) -> tuple[tuple[Finding, ...], str]:
+    """Return the findings and the reason of a chosen hold when a smooth force replaces lines.
+
+    Args:
+        findings: Findings of the session, the choice of the hold among them.
+        reason: Reason for which lines were chosen; see `hold_setting`.
+        gain: Log-likelihood under the smooth force minus that under lines [nats].
+    """
+    smooth = f"a smooth curve in place of lines raises the log-likelihood by {gain:.3g}"
+    what = f"{_CHOSEN}, and 'band_limited' is used: the force is not held, and {smooth}"
+    hint = "state hold = 'band_limited' in [log] to confirm it, or hold = 'linear'"
+    changed = (replace(f, what=what, hint=hint) if f.what.startswith(_CHOSEN) else f for f in findings)
+    return tuple(changed), f"lines: {reason}; {smooth}"
 
 
 def hold_setting(before: str, other: str, gaps: np.ndarray, unit: str) -> dict[str, str]:

@@ -181,7 +181,9 @@ def _prediction_error(
     numerics: Numerics | None = None,
     hessian: bool | None = None,
     profile: Sequence[str] | None = None,
+    start: np.ndarray | None = None,
 ) -> Steps[Estimate]:
+    """Fit from the values of inverse dynamics, or from a start that is near the optimum."""
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
     from jaxid.estimators.prediction_error import prediction_error_steps
     from jaxid.estimators.several.parts import Part, parts_of
@@ -193,20 +195,15 @@ def _prediction_error(
     }
     need_no_profile(session, precision["profile"])
     need_no_hessian(session, precision["hessian"])
+    alone = start is not None
+    if start is None:
+        several = _inverse_dynamics(session) if session.more else inverse_dynamics_steps(machine, run.data)
+        start = _whole((yield from several), machine)
+    options: dict[str, Any] = {"start": start, "numerics": numerics, "alone": alone}
     if session.more:
-        first = yield from _inverse_dynamics(session)
-        start = _whole(first, machine)
-        return (yield from prediction_error_steps(machine, parts_of(session), start=start, numerics=numerics))
-    first = yield from inverse_dynamics_steps(machine, run.data)
-    return (
-        yield from prediction_error_steps(
-            machine,
-            [Part.alone(machine, run.log, run.data)],
-            start=_whole(first, machine),
-            numerics=numerics,
-            **precision,
-        )
-    )
+        return (yield from prediction_error_steps(machine, parts_of(session), **options))
+    part = Part.alone(machine, run.log, run.data)
+    return (yield from prediction_error_steps(machine, [part], **options, **precision))
 
 
 def _whole(first: Estimate, machine: Machine) -> np.ndarray | None:

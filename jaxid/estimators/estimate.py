@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,9 @@ from jaxtyping import Bool, Float
 
 from jaxid.machine import Machine
 from jaxid.numerics.precision import Precision
+
+# Half width of a 95 % interval in standard deviations.
+_INTERVAL = 1.96
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,17 @@ class Estimate:
         if name not in self.names:
             raise KeyError(f"{name!r} is not among {', '.join(self.names)}.")
         return float(self.theta[self.names.index(name)])
+
+    def holding(self, *others: Float[np.ndarray, " p"]) -> Estimate:
+        """Return the estimate with 95 % intervals that hold other values of the unknowns too, (p,) each."""
+        if not others:
+            return self
+        away = np.max([np.abs(theta - self.theta) for theta in others], axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            wider = 1 + away / (_INTERVAL * self.std)
+        factor = np.where(np.isfinite(wider), wider, 1.0)
+        beside = None if self.std_misspecified is None else self.std_misspecified * factor
+        return replace(self, precision=self.precision.widened(factor), std_misspecified=beside)
 
     def __str__(self) -> str:
         lines = []

@@ -26,8 +26,6 @@ from jaxid.numerics.lanes import Steps
 if TYPE_CHECKING:
     from jaxid.session import Session
 
-# Half width of a 95 % interval in standard deviations.
-_INTERVAL = 1.96
 # Settings that are chosen, and the values that the velocity has.
 _HOLD, _VELOCITY = "reference_hold", "loop_velocity"
 _DIFFERENCED, _MEASURED = "differenced", "measured"
@@ -78,7 +76,7 @@ def with_loop_of_log(session: Session, estimate: Estimate, **options: Any) -> St
     best = min(scaled, key=lambda settings: float(np.sum(scaled[settings] ** 2)))
     counts = np.ones(scaled[best].shape, bool)
     equal = [s for s in scaled if s != best and not clearly_smaller(scaled[best], scaled[s], counts)]
-    chosen = _widened(loops[best].estimate, [loops[s].estimate.theta for s in equal])
+    chosen = loops[best].estimate.holding(*(loops[s].estimate.theta for s in equal))
     reason = _reason(loops, best, equal, log.force.shape[1])
     return _said(chosen, estimate, dict(best), reason)
 
@@ -102,17 +100,6 @@ def _open_loops(session: Session) -> dict[tuple[tuple[str, str], ...], Machine]:
         out[*settings, (_VELOCITY, _DIFFERENCED)] = made
         out[*settings, (_VELOCITY, _MEASURED)] = replace(made, controller=measuring)
     return out
-
-
-def _widened(estimate: Estimate, others: list[Float[np.ndarray, " p"]]) -> Estimate:
-    """Return an estimate whose 95 % intervals hold other values too."""
-    if not others:
-        return estimate
-    away = np.max([np.abs(theta - estimate.theta) for theta in others], axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        wider = 1 + away / (_INTERVAL * estimate.std)
-    factor = np.where(np.isfinite(wider), wider, 1.0)
-    return replace(estimate, precision=estimate.precision.widened(factor))
 
 
 def _reason(
