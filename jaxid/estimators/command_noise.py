@@ -34,6 +34,9 @@ _AT_BOUND = 1e-9
 # A correction that changes a value by more than this part of it must leave the measured force as well
 # explained: it may raise the RMS of what the values leave by this factor.
 _LARGE, _WORSE = 0.02, 1.1
+# Steps that bring a correction back to the ridge of the likelihood. They end with one that is shorter than so
+# many standard deviations.
+_RETURNS, _SHORT = 4, 0.05
 # Widening of standard deviations by an uncertain correction from which on a note says so.
 _DOUBTFUL = 1.2
 
@@ -123,13 +126,14 @@ def corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[Corrected]:
     lower, upper = fit.bounds
     lower[fit.unknowns :], upper[fit.unknowns :] = -np.inf, np.inf
 
-    def without(step: np.ndarray) -> np.ndarray:
-        moved = end.x + whole.taken_back(step, pressed, (lower - end.x, upper - end.x))
+    def without(step: np.ndarray) -> Steps[np.ndarray]:
+        room = lower - end.x, upper - end.x
+        moved = yield from _on_the_ridge(fit, end, whole.taken_back(step, pressed, room))
         return np.clip(fit.theta(moved), *fit.machine.parameters.bounds)
 
     line, parabola, bent = extrapolations(half, whole)
-    by_line, by_parabola = without(line), without(parabola)
-    found = by_line if bent else by_parabola
+    found = yield from without(line if bent else parabola)
+    doubt = np.abs((yield from without(parabola)) - found) if bent else as_it_is.doubt
     more = growth_of_gap(fit, end.theta, found)
     if more > _WORSE:
         note = (
@@ -137,7 +141,46 @@ def corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[Corrected]:
             f"leave {more:.3g} times as much of the measured force, so that a part of this noise is none"
         )
         return replace(as_it_is, refused=note)
-    return Corrected(found, reads, np.abs(by_parabola - by_line) if bent else as_it_is.doubt)
+    return Corrected(found, reads, doubt)
+
+
+def _on_the_ridge(fit: JointLikelihood, end: Maximum, shift: np.ndarray) -> Steps[np.ndarray]:
+    """Return a point a step away from the maximum, moved to the ridge of the likelihood.
+
+    A log may determine a ratio a thousand times better than its parts. The likelihood then has a ridge, which
+    is curved: a long step along its tangent leaves it. A slope that is added to the likelihood moves its
+    maximum by that step if the likelihood is a parabola. The maximum with the slope is found from the end of
+    the step by scoring. The noises stay as they are.
+
+    Args:
+        fit: The likelihood.
+        end: Its maximum.
+        shift: The step, (q,). Values that it takes to a bound stay there.
+
+    Returns:
+        The maximum with the slope, or the end of the step if that is not found.
+    """
+    fixed = np.arange(shift.size) >= fit.unknowns
+    first = np.where(fixed, end.x, end.x + shift)
+    there = fit.sum_of(end.scored)
+    slope = -(there.gradient + there.normal @ (first - end.x))
+    lower, upper = fit.bounds
+    fixed |= (first <= lower + _AT_BOUND) | (first >= upper - _AT_BOUND)
+
+    x, before = first, np.inf
+    for _ in range(_RETURNS):
+        here = yield from fit.evaluate(x)
+        if not here.finite:
+            return first
+        room = np.where(fixed, 0.0, lower - x), np.where(fixed, 0.0, upper - x)
+        step = _bounded_step(here.normal, here.gradient + slope, room)
+        size = float(np.sqrt(max(step @ here.normal @ step, 0.0)))
+        if size > before:
+            return first
+        x, before = x + step, size
+        if size < _SHORT:
+            break
+    return x
 
 
 def growth_of_gap(
@@ -152,8 +195,8 @@ def growth_of_gap(
         fitted, corrected: Values of the unknowns, (p,) each.
 
     Returns:
-        Ratio of the RMS forces over all logs, as a root mean square over the joints; one where the correction
-        is small, or where a joint has no encoder.
+        Ratio of the RMS forces over all logs, as a root mean square over the driven joints; one where the
+        correction is small, or where a joint has no encoder.
     """
     from jaxid.gap import force_gap
 
@@ -162,10 +205,13 @@ def growth_of_gap(
     if not large or not all(all(part.log.measured) for part in parts):
         return 1.0
 
+    # A joint without a drive has no measured force: its gap is what the others exert on it.
+    plant = fit.machine.plant
+    driven = np.asarray(plant.driven(plant.joints))
     squares = []
     for theta in (fitted, corrected):
         gaps = [force_gap(part.at(theta), part.prepared or _prepared(part)) for part in parts]
-        squares.append(sum(gap.rms**2 for gap in gaps))
+        squares.append(sum(gap.rms[driven] ** 2 for gap in gaps))
     return float(np.sqrt(np.nanmean(squares[1] / squares[0])))
 
 
@@ -216,14 +262,23 @@ class Shift:
             pressed: Gradient of the negative log-likelihood at the maximum, zero away from bounds.
             room: Least and largest step.
         """
-        norm, eigenvalues, vectors = _scaled(self.information)
-        root = np.sqrt(eigenvalues)
-        target = -(vectors.T @ (pressed / norm)) / root - root * (vectors.T @ (step * norm))
-        # Rounding must not put a value that rests at its bound outside.
-        least, most = np.minimum(room[0], 0.0) * norm, np.maximum(room[1], 0.0) * norm
-        most = np.maximum(most, least + np.finfo(np.float64).tiny)
-        matrix = root[:, None] * vectors.T
-        return scipy.optimize.lsq_linear(matrix, target, (least, most), method="bvls").x / norm
+        return _bounded_step(self.information, pressed + self.information @ step, room)
+
+
+def _bounded_step(
+    information: Float[np.ndarray, "q q"],
+    gradient: Float[np.ndarray, " q"],
+    room: tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]],
+) -> Float[np.ndarray, " q"]:
+    """Return the step to the least value of a parabola with this curvature and slope, within bounds."""
+    norm, eigenvalues, vectors = _scaled(information)
+    root = np.sqrt(eigenvalues)
+    target = -(vectors.T @ (gradient / norm)) / root
+    # Rounding must not put a value that rests at its bound outside.
+    least, most = np.minimum(room[0], 0.0) * norm, np.maximum(room[1], 0.0) * norm
+    most = np.maximum(most, least + np.finfo(np.float64).tiny)
+    matrix = root[:, None] * vectors.T
+    return scipy.optimize.lsq_linear(matrix, target, (least, most), method="bvls").x / norm
 
 
 def _noise_of_reading(member: Member, x: np.ndarray) -> Float[np.ndarray, " m"]:

@@ -198,22 +198,27 @@ class JointLikelihood:
             own = np.clip(theta[member.part.index], *member.problem.bounds)
             x[place] = np.concatenate([np.asarray(member.problem.transform.inward(own)), noise])
         options = {"tolerance": (0.0, _TOLERANCE), "max_steps": most, "damping": _DAMPING}
-        found: Descent = yield from descent_steps(self._evaluate, x, self.bounds, **options)
+        found: Descent = yield from descent_steps(self.evaluate, x, self.bounds, **options)
         noises = [found.x[place[m.unknowns :]] for m, place in zip(self.members, self.places, strict=True)]
         ended = (found.model.cost, found.converged and found.model.finite, found.steps)
         return Maximum(found.x, self.theta(found.x), noises, found.model.content, *ended)
 
-    def _evaluate(self, x: np.ndarray) -> Steps[Model]:
+    def evaluate(self, x: np.ndarray) -> Steps[Model]:
         """Compute the negative log-likelihood with its gradient and information."""
-        cost, gradient, normal = 0.0, np.zeros(x.size), np.zeros((x.size, x.size))
         found = []
         for member, place in zip(self.members, self.places, strict=True):
-            scored = yield from scored_at(member.problem, x[place], member.unknowns)
-            found.append(scored)
-            cost += float(scored.cost)
-            gradient[place] += scored.gradient
-            normal[np.ix_(place, place)] += _information(scored)
-        return Model(cost, gradient, normal, found)
+            found.append((yield from scored_at(member.problem, x[place], member.unknowns)))
+        return self.sum_of(found)
+
+    def sum_of(self, scored: list[Scored]) -> Model:
+        """Return the negative log-likelihood of all logs with its gradient and information."""
+        size = self.unknowns + sum(m.noises for m in self.members)
+        cost, gradient, normal = 0.0, np.zeros(size), np.zeros((size, size))
+        for place, one in zip(self.places, scored, strict=True):
+            cost += float(one.cost)
+            gradient[place] += one.gradient
+            normal[np.ix_(place, place)] += _information(one)
+        return Model(cost, gradient, normal, scored)
 
 
 def scored_at(problem: Innovations, x: np.ndarray, p: int) -> Steps[Scored]:
