@@ -88,8 +88,8 @@ def table(records: list[dict[str, Any]]) -> str:
         "range of so many Bernoulli draws at 95 %, and the largest deviation in standard deviations.",
         "Truth, motion and noise are drawn in each run. Efficiency is the bound of Cramer and Rao, by the",
         "innovations of the Kalman filter at the truth, over the mean squared error. Jointly: the share of",
-        "runs whose 95 % ellipsoid, by the covariance of all printed values, holds the truth; older runs have",
-        "none.",
+        "runs whose 95 % ellipsoid, by the covariance of all printed values, holds the truth; older runs",
+        "have none.",
         "",
         "| cell | method | seeds | runs | failed | values | 95 % holds | range | largest | jointly "
         "| efficiency | not printed | s a fit | commit |",
