@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.first_case.words import FORCES, Meaning, meaning_of_joint
+from jaxid.logs.log import MINIMUM_SAMPLES
 from jaxid.logs.readers.dialect import split_unit
 from jaxid.logs.rough_inertia import correlation
 from jaxid.logs.units import fits, parse_unit
@@ -140,6 +141,9 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
     Raises:
         InputError: If no column can be the position or the velocity of a joint.
     """
+    if not columns:
+        what = f"is too short: no column has two numbers; at least {MINIMUM_SAMPLES} samples are needed"
+        raise InputError(what, where=where, hint="log for longer, or export the log again")
     said: list[str] = []
     questions: dict[str, str] = {}
     time = _time(columns, said, questions)

@@ -204,6 +204,12 @@ def test_names_that_say_nothing(tmp_path):
         jaxid.init({**named, "ch2": log["u"]})
 
 
+def test_a_log_of_one_row_is_too_short(tmp_path):
+    path = write_csv(tmp_path / "log.csv", {name: values[:1] for name, values in signals(400).items()})
+    with pytest.raises(InputError, match="log.csv: is too short: no column has two numbers"):
+        jaxid.init(path)
+
+
 def test_a_force_that_brakes(tmp_path):
     log = recorded()
     first = jaxid.init({**log, "u": -log["u"]})
