@@ -33,7 +33,7 @@ def friction(*values: float, names: tuple[str, ...] = FRICTION) -> dict[str, flo
     return dict(zip(names, values, strict=True))
 
 
-SIMULATED = "exact simulation"
+SIMULATED = "simulation, to some counts of the encoder"
 FEEDFORWARD = friction(0.02, 0.12, 0.25)
 TIME = friction(0.05, 0.15, 0.4)
 SWING = friction(1.9e-4, 0.021 / 9.81, 4e-4, names=PENDULUM)
