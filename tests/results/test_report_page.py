@@ -91,11 +91,20 @@ def test_a_ripple_is_drawn_over_the_position_folded_at_its_period(found):
     data = discovery_data(found)
     where = {"joint": 1, "text": "joint 1: the residual repeats", "periods": [0.0125, 0.3]}
     page = render(replace(data, where={**data.where, **where}))
-    assert "Before and after: force residual over position, folded at 0.0125 m" in words(page)
+    assert "Before and after: force residual over position, folded at 12.5 mm" in words(page)
     # A figure of the log has it over the whole position.
     assert ': force residual over position"' in page
     elsewhere = words(render(replace(data, where={**data.where, **where, "joint": 2})))
     assert "folded at" not in elsewhere
+
+
+@pytest.mark.parametrize(("fitted", "drawn"), [(0.0127, "12.7 mm"), (0.02, "12.5 mm")])
+def test_a_ripple_that_was_found_is_folded_at_its_fitted_period(found, fitted, drawn):
+    data = discovery_data(found)
+    where = {**data.where, "joint": 1, "text": "joint 1: the residual repeats", "periods": [0.0125]}
+    [effect] = data.effects
+    ripple = {**effect, "parameters": {**effect["parameters"], "period": {"value": fitted, "unit": "m"}}}
+    assert f"folded at {drawn}" in words(render(replace(data, where=where, effects=(effect, ripple))))
 
 
 def test_the_place_of_an_unexplained_residual_is_said_first(found):

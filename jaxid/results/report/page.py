@@ -22,7 +22,7 @@ from jaxid.results.report.data import ExperimentView, HistoryView, LogView, Repo
 from jaxid.results.report.figure_tables import tables_of
 from jaxid.results.report.force_plots import plot_forces, plot_frictions
 from jaxid.results.report.history_plots import plot_history
-from jaxid.results.report.numbers import is_number, nats, pretty_unit, short
+from jaxid.results.report.numbers import is_number, nats, pretty_unit, scaled_unit, short
 from jaxid.results.report.pose_plots import plot_poses, pose_table
 from jaxid.results.report.profile_plots import plot_profiles
 from jaxid.results.report.telling import telling_variable
@@ -32,6 +32,8 @@ View = LogView | ExperimentView | HistoryView
 _NARROW = (4.6, 4.4)  # inch; about a phone's width at the plots' text size
 _HALF = (5.6, 3.5)  # inch; half the width of a page
 _LOW = (11.5, 3.4)  # inch; its whole width
+# Part by which the period of a fitted ripple may differ from that of the residual.
+_SAME_PERIOD = 0.05
 _RASTER_DPI = 130  # Chosen: sharp on a phone, and ten clouds stay below a megabyte
 
 
@@ -138,7 +140,8 @@ def _telling(data: ReportData, main: int | None) -> dict | None:
     if period is not None:
         # Over a stroke of hundreds of periods nothing is seen; within one the samples lie on the ripple.
         view, variable = replace(view, position=np.mod(view.position, period)), "position"
-        within = f", folded at {short(period, 4)} {pretty_unit(units['position'])}"
+        scale, unit = scaled_unit(units["position"], [period])
+        within = f", folded at {short(period / scale, 4)} {unit}"
     figure = plots.plot_residual_against(view, units, variables=(variable,), size=size)
     title = f"{'Before and after: force' if both else 'Force'} residual over {variable}{within}"
     title += f" ({view.name})" if len(data.views) > 1 else ""
@@ -150,10 +153,14 @@ def _telling(data: ReportData, main: int | None) -> dict | None:
 
 
 def _period(data: ReportData, view: LogView) -> float | None:
-    """Return the period of the largest ripple that a search saw in the residual of a log's joint."""
+    """Return the period of the largest ripple in a residual: as fitted, or as the search saw it."""
     where = data.where or {}
     periods = where.get("periods") or []
-    return periods[0] if periods and where.get("joint") == view.joint + 1 and not view.steady else None
+    if not periods or where.get("joint") != view.joint + 1 or view.steady:
+        return None
+    effects = (e for e in data.effects if e["joint"] == where["joint"] and "period" in e["parameters"])
+    fitted = [abs(effect["parameters"]["period"]["value"]) for effect in effects]
+    return next((p for p in fitted if abs(p / periods[0] - 1) < _SAME_PERIOD), periods[0])
 
 
 def _beside(entry: dict, telling: dict | None) -> dict | None:
