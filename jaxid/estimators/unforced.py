@@ -234,7 +234,8 @@ def with_free_scale(estimate: Estimate, machine: Machine, group: tuple[int, ...]
     names = ", ".join(free[k].name for k in group)
     note = (
         f"the log has no force, and nothing known gives one: {names} may all be multiplied by one factor; "
-        "state one of them as a number (an inertia or weight that was measured, a gain of a data sheet)"
+        "state one of them as a number (an inertia or weight that was measured, a gain of a data sheet), or "
+        "fit a second log with a payload or gain that is known there, stated by set in its [[fit]]"
     )
     return replace(
         estimate,

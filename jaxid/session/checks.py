@@ -10,6 +10,9 @@ from jaxid.logs.log import Log
 from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine
 
+# Period of a log from which on it is probably not that of the servo's own loop [s].
+_SLOW_LOOP = 2.5e-3
+
 
 def log_findings(case: Case, log: Log, machine: Machine, short: bool, *, alone: bool = True) -> list[Finding]:
     """Check a log, and return the findings.
@@ -43,6 +46,8 @@ def log_findings(case: Case, log: Log, machine: Machine, short: bool, *, alone: 
         free=True,
     )
     check_absent(case, machine, log, alone=alone)
+    if machine.unforced(log) and case.controller is not None and log.period > _SLOW_LOOP:
+        findings += [] if case.controller.period else [_assumed_period(case, log)]
 
     impossible = plant.impossible(log.position) if all(log.measured) else None
     if impossible is not None:
@@ -57,6 +62,16 @@ def log_findings(case: Case, log: Log, machine: Machine, short: bool, *, alone: 
 
     raise_on_error(findings)
     return findings
+
+
+def _assumed_period(case: Case, log: Log) -> Finding:
+    """Return the warning that a slow log's period is taken for that of the servo's loop."""
+    return Finding(
+        "warning",
+        f"the period of the servo's loop is not stated: that of the log, {1e3 * log.period:.3g} ms, is taken",
+        f"{case.where}, [controller]",
+        "state period: most servos run their loop at 200 Hz to some kHz, and gains depend on it",
+    )
 
 
 def parts_left_out(case: Case) -> list[Finding]:

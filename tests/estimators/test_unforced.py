@@ -9,6 +9,7 @@ import pytest
 import jaxid
 from benchmarks.unforced import covered, of
 from jaxid.errors import InputError
+from jaxid.session import open_session
 from truth.axis.machines import Setup, moves, multisine
 from truth.axis.stepper import Loop, Machine, Sensor
 
@@ -114,7 +115,9 @@ def test_without_anything_known_the_ratios_stand_and_no_absolute_value(tmp_path)
     assert content["gap"]["fit"] is None
     assert content["gap"]["noise_floor"] is None
     assert content["gap"]["simulation"]["fit"] < 6e-4
-    assert "may all be multiplied by one factor" in " ".join(content["notes"])
+    notes = " ".join(content["notes"])
+    assert "may all be multiplied by one factor" in notes
+    assert "a payload or gain that is known there, stated by set in its [[fit]]" in notes
 
 
 @pytest.mark.slow
@@ -123,6 +126,17 @@ def test_a_missing_ripple_makes_the_model_incomplete():
     result = identify(CASE, log(**ripple))
     assert result.model_complete is False
     assert "gap of the simulated position" in result.findings[0]
+
+
+@pytest.mark.parametrize(("every", "stated"), [(1, False), (10, False), (10, True)])
+def test_the_period_of_a_slow_log_is_questioned_as_that_of_the_loop(every, stated):
+    given = {name: values[::every] for name, values in log().items()}
+    assert "period = 0.001\n" in CASE
+    case = CASE if stated else CASE.replace("period = 0.001\n", "")
+    found = open_session(tomllib.loads(case), given).findings
+    assert [f.what for f in found if "period of the servo's loop" in f.what] == (every > 1 and not stated) * [
+        "the period of the servo's loop is not stated: that of the log, 10 ms, is taken"
+    ]
 
 
 def test_a_loop_without_a_reference_is_refused():
