@@ -86,6 +86,24 @@ def test_the_motor_alone(log):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seconds", [25.0, 100.0])
+def test_the_motor_alone_at_the_published_noise_gives_no_values(tmp_path, capsys, seconds):
+    """The fit fell back to one body, of 106.7 +- 0.3 kg: the sum of motor, true 72.3 kg, and load."""
+    log = flexible.write(flexible.flexible_log(duration=seconds, force_noise=0.8), tmp_path)
+    (tmp_path / "case.toml").write_text(flexible.case("motor"))
+    arguments = ["identify", str(tmp_path / "case.toml"), str(log), "--method", "minimal_model"]
+    assert main([*arguments, "-o", str(tmp_path / "out")]) == 1
+    printed = capsys.readouterr().out
+    assert printed.startswith(
+        "The fit did not converge: noise of the force, which is in the differentiated columns"
+    )
+
+    content = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert not content["converged"]
+    assert all(p["value"] is None and p["std"] is None for p in content["parameters"].values())
+
+
+@pytest.mark.slow
 def test_the_load_turns_round_unseen(tmp_path):
     """Where it does its friction has another sign than the motor's: left in, 0.10 N at a sample."""
     made = flexible.flexible_log(duration=12.0, force_noise=0.0, resolution=0.0)
