@@ -64,7 +64,7 @@ def published(folder: Path, runs: int) -> None:
         )
         guesses = stages.drawn(data, data=data)
         for name, true, value, std in zip(estimate.names, truth, estimate.theta, estimate.std, strict=True):
-            told = f"{100 * std / abs(value):.1f}" if np.isfinite(std) else "not told"
+            told = f"{100 * std / abs(value):.1f}" if np.isfinite(std) else "not identified"
             table.row(
                 name, f"{true:.3g}", f"{guesses[name]:.3g}", f"{value:.3g}", told, PUBLISHED[name][data - 1]
             )
@@ -124,7 +124,7 @@ def unrecorded(folder: Path, runs: int) -> None:
                 f"{true[key]:.4g}",
                 f"{true[key] * REFERENCE_OFF[key]:.4g}",
                 f"{found.value(name):.4g}",
-                f"{std:.2g}" if np.isfinite(std) else "not told",
+                f"{std:.2g}" if np.isfinite(std) else "not identified",
             )
     table.show(time.perf_counter() - start)
 

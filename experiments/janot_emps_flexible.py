@@ -181,7 +181,7 @@ def cell_of(estimate: Estimate, name: str) -> str:
     """Value and standard deviation of a parameter, or that it is not told."""
     k = estimate.names.index(name)
     if not estimate.identifiable[k]:
-        return "not told"
+        return "not identified"
     return f"{estimate.theta[k]:.4g} ± {estimate.std[k]:.2g}"
 
 
@@ -215,7 +215,7 @@ def trajectories(folder: Path) -> bool:
             found = jaxid.identify(*written(folder, stem, log, text), method="inverse_dynamics").estimate
             std = found.std[[found.names.index(n) for n in found.names if "friction" in n]]
             split[name, sensors] = std
-            table.row(name, sensors, *(f"{s:.2g}" if np.isfinite(s) else "not told" for s in std))
+            table.row(name, sensors, *(f"{s:.2g}" if np.isfinite(s) else "not identified" for s in std))
     table.show(time.perf_counter() - begin)
     return bool(np.all(np.isfinite(split["with pulses", "both encoders"])))
 
@@ -304,7 +304,7 @@ def _errors(case: Path, data: Path, method: str) -> dict[str, float]:
 
 
 def _cell(errors: dict[str, float], name: str) -> str:
-    return f"{errors[name]:.2g}" if name in errors else "not told" if errors else "failed"
+    return f"{errors[name]:.2g}" if name in errors else "not identified" if errors else "failed"
 
 
 def hidden(folder: Path) -> bool:

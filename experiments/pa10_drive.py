@@ -123,7 +123,7 @@ def chain(folder: Path) -> None:
         kind, _, parameter = name.partition(".")
         std = [f.estimate.std[f.estimate.names.index(name)] for f in fits]
         cells = [f"{f.value(name):.4f} +- {s:.2g}" for f, s in zip(fits, std, strict=True)]
-        cells = [c if np.isfinite(s) else "not told" for c, s in zip(cells, std, strict=True)]
+        cells = [c if np.isfinite(s) else "not identified" for c, s in zip(cells, std, strict=True)]
         table.row(name, f"{true[kind][parameter]:.4f}", *cells)
     physical = [_physical(f.value) for f in fits]
     truths = (ACTUAL * AMPLIFIER, OFFSET, supply, RESISTANCE)

@@ -149,7 +149,7 @@ def partial(folder: Path) -> bool:
     true, slid = true_values(case), np.abs(run.velocity) > 1e-3
     first = [f"{1e3 * run.log.time[np.argmax(s)]:.0f}" if s.any() else "never" for s in slid.T]
     print(f"\nonly mass 2 driven: the masses first slide at {', '.join(first)} ms")
-    head = ["until [s]", *AIMS, "not told"]
+    head = ["until [s]", *AIMS, "not identified"]
     table = Table("told from the first instants: largest error [%] (how many)", head)
     good = True
     for until in (0.05, 0.1, 0.2, 0.3, 0.5, 1.0):
