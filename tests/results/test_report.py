@@ -237,6 +237,11 @@ def test_verdicts_are_in_plain_words():
     assert "found: coulomb_friction (joint 2)" in _words(render(_discovery(effects=(place,), views=())))
 
 
+@pytest.mark.parametrize(("complete", "style"), [(True, "good"), (None, "open"), (False, "open")])
+def test_only_a_complete_model_has_a_green_badge(complete, style):
+    assert f'<p class="badge {style}">' in render(_identification(model_complete=complete))
+
+
 def test_gap_of_several_joints_and_logs():
     words = _words(
         render(

@@ -81,7 +81,7 @@ def verdict_class(data: ReportData) -> str:
         return "bad"
     if data.verdict == "unexplained" or data.model_complete is False or not data.identified:
         return "open"
-    if data.verdict is None and not all(row.identifiable for row in data.parameters):
+    if data.verdict is None and not (data.model_complete and all(p.identifiable for p in data.parameters)):
         return "open"
     if data.verdict == "nothing_missing" and not data.model_complete:
         return "open"
