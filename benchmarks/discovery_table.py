@@ -90,13 +90,16 @@ def markdown(table: dict) -> str:
     ]
     rows = [
         [name, _text(value), f"{'<=' if AIMS[name][1] else '>='} {AIMS[name][0]:g}",
-         "" if value is None else "yes" if holds(name, value) else "NO"]
+         "yes" if holds(name, value) else "NO"]
         for name, value in table["totals"].items()
+        if value is not None
     ]  # fmt: skip
     parts.append(_grid(["total", "is", "aim", "met"], rows))
-    parts += ["## At a glance: named right of visible", glance(table)]
+    if table["effects"]:
+        parts += ["## At a glance: named right of visible", glance(table)]
     for title in ("effects", "pairs", "short", "chains"):
-        parts += [f"## {title.capitalize()}, visible ones", _results(table[title])]
+        if table[title]:
+            parts += [f"## {title.capitalize()}, visible ones", _results(table[title])]
     parts += ["## Seconds", _lines("discover", table["seconds"])]
     for title in ("wrong", "false positives", "outside", "invisible", "tied"):
         entries = [f"- {' | '.join(map(str, e.values()))}" for e in table[title]]
@@ -141,12 +144,13 @@ def _named(single: Sequence[Record], pairs: Sequence[Record], nulls: Sequence[Re
     strictly, alike = (sum(map(judged, single)) for judged in (judge.strictly_right, judge.right))
     both = sum(map(judge.right, pairs))
     false = sum(map(judge.false_positive, nulls))
-    return (
+    said = {
         f"Of visible single effects {strictly} of {len(single)} are named strictly, {alike} strictly or as "
-        "one of rivals that explain both logs as well. "
-        f"Of visible pairs both are named in {both} of {len(pairs)}. "
-        f"Of {len(nulls)} complete models {false} are not called complete."
-    )
+        "one of rivals that explain both logs as well.": single,
+        f"Of visible pairs both are named in {both} of {len(pairs)}.": pairs,
+        f"Of {len(nulls)} complete models {false} are not called complete.": nulls,
+    }
+    return " ".join(sentence for sentence, of in said.items() if of)
 
 
 def _visible(records: Iterable[Record]) -> list[Record]:
