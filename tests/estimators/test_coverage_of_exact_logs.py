@@ -61,6 +61,18 @@ def test_output_error_counts_the_noise_of_the_force(tmp_path, loop, sensor, seed
     assert fit.std[0] < 0.01 * true["inertia"]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("loop", ["known", "unknown"])
+def test_an_arm_without_a_declared_loop_is_given_with_a_doubt(tmp_path, loop):
+    """Fewer than 95 % of such intervals hold; see docs/methods.md."""
+    text, log, _ = MACHINES["arm"](0, loop, "stated")
+    path = tmp_path / "case.toml"
+    path.write_text(text)
+    fit = jaxid.identify(path, log).estimate
+    assert fit.method == "prediction_error"
+    assert any("its intervals are too narrow" in note for note in fit.notes) == (loop == "unknown")
+
+
 def test_a_machine_that_sticks_at_first_starts_at_rest(tmp_path):
     """The start that is fitted to its first readings once had 5.6 m/s."""
     text, log, true = MACHINES["chain"](7, "open", "stated")
