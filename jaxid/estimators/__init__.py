@@ -197,8 +197,8 @@ def _prediction_error(
     need_no_hessian(session, precision["hessian"])
     alone = start is not None
     if start is None:
-        several = _inverse_dynamics(session) if session.more else inverse_dynamics_steps(machine, run.data)
-        start = _whole((yield from several), machine)
+        first = _inverse_dynamics(session) if session.more else inverse_dynamics_steps(machine, run.data)
+        start = _whole((yield from first), machine)
     options: dict[str, Any] = {"start": start, "numerics": numerics, "alone": alone}
     if session.more:
         return (yield from prediction_error_steps(machine, parts_of(session), **options))

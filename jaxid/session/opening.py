@@ -281,7 +281,8 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
         machine=machine,
         fit=opened[0],
         validations=tuple(opened[1:]),
-        findings=tuple(findings),
+        # What holds of the case is found with every log.
+        findings=tuple(dict.fromkeys(findings)),
         settings=found.settings,
         more=tuple(more),
     )

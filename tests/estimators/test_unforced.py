@@ -139,6 +139,13 @@ def test_the_period_of_a_slow_log_is_questioned_as_that_of_the_loop(every, state
     ]
 
 
+def test_the_period_is_questioned_once_for_several_logs():
+    given = [{name: values[::10] for name, values in log(seed).items()} for seed in (0, 1)]
+    case = tomllib.loads(CASE.replace("period = 0.001\n", ""))
+    found = open_session(case, given).findings
+    assert sum("period of the servo's loop" in f.what for f in found) == 1
+
+
 def test_a_loop_without_a_reference_is_refused():
     given = log()
     given.pop("r")
