@@ -180,9 +180,11 @@ def identify_many(
 
     def steps(case: Case, log: LogLike) -> Steps[Estimate]:
         session = open_session(case, log, method=method)
-        choice = None if method is not None else choose_method(session)
-        _, estimate = yield from _tested(method if choice is None else choice.method, session, {})
-        return estimate if choice is None else with_choice(estimate, choice)
+        if method is not None:
+            return (yield from _tested(method, session, {}))[1]
+        choice = choose_method(session)
+        _, estimate = yield from _tested(choice.method, session, {})
+        return with_choice(estimate, choice)
 
     return run_batched([steps(*of) for of in zip(cases, logs, strict=True)], lanes)
 
