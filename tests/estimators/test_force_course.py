@@ -10,7 +10,7 @@ from truth.axis.cases import case_text
 from truth.axis.machines import Setup
 from truth.axis.stepper import Loop, Machine, Sensor
 
-RATE, FINE, SECONDS = 200.0, 20_000.0, 10.0
+RATE, FINE, SECONDS = 200.0, 20_000.0, 5.0
 # Noise of the encoder under which the two courses are the same [rad].
 NOISY = 2e-3
 TRUE = {"viscous_friction": {"coefficient": 0.15}, "coulomb_friction": {"level": 0.4}}
