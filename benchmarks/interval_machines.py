@@ -13,7 +13,8 @@ import numpy as np
 from truth.arm.two_links import TwoLinks, run_sampled
 from truth.axis.cases import case_text
 from truth.axis.machines import EMPS_LOOP, Setup, emps_like, moves, multisine
-from truth.axis.stepper import Loop, Machine, Sensor
+from truth.axis.slow_axis import slow_axis
+from truth.axis.stepper import Loop, Sensor
 from truth.chain import flexible_axes, stages
 from truth.chain.stepper import ChainMachine, simulate_chain
 
@@ -59,31 +60,23 @@ def axis(seed: int, loop: str, sensor: str) -> Run:
 def ball_screw(seed: int, loop: str, sensor: str) -> Run:
     """Return case, columns and truth of a ball-screw axis of 180 kg with Stribeck friction, 24 s at 1 kHz.
 
-    It tours at speeds of 6 to 150 mm/s. The encoder's noise is a third of a count, so that it dithers little.
+    It moves slowly at times. The encoder's noise is a third of a count, so that it dithers little.
     """
-    rng, seconds = np.random.default_rng([6, seed]), 24.0
-    scale = rng.uniform(0.8, 1.2, 5).tolist()
+    rng = np.random.default_rng([6, seed])
+    base = slow_axis(seed, duration=24.0)
     effects = {
-        "viscous_friction": {"coefficient": 400.0 * scale[1]},
-        "coulomb_friction": {"level": 60.0 * scale[2]},
-        "stribeck_friction": {"level": 35.0 * scale[3], "velocity": 0.012 * scale[4]},
+        kind: {name: value * rng.uniform(0.8, 1.2) for name, value in values.items()}
+        for kind, values in base.machine.effects.items()
     }
-    true = {f"{kind}.{name}": value for kind, of in effects.items() for name, value in of.items()}
-    true = {"inertia": 180.0 * scale[0], **true}
-    t = np.arange(round(1000 * seconds)) / 1000.0
+    true = {"inertia": base.machine.inertia * rng.uniform(0.8, 1.2)}
+    true |= {f"{kind}.{name}": value for kind, of in effects.items() for name, value in of.items()}
+    machine = dataclasses.replace(base.machine, inertia=true["inertia"], effects=effects)
+    law = base.loop
     if loop == "open":
-        law = Loop(
-            kind="open_loop", input=multisine(t, [0.3, 0.8, 1.9, 3.7], 1.2 * rng.uniform(0.9, 1.1), seed)
-        )
-    else:
-        speeds = np.tile([0.006, 0.015, 0.05, 0.15], 6) * rng.uniform(0.7, 1.4, 24)
-        strokes = np.array([(-1) ** k for k in range(24)]) * speeds * rng.uniform(0.5, 1.5, 24)
-        points = np.concatenate([[0.0], np.cumsum(strokes)])
-        reference = moves(t, points, [*speeds, 0.1], 0.8, rest=0.1)
-        law = Loop(kind="cascade_pd", kp=40.0, kv=72.0, velocity_average=2, limit=20.0, reference=reference)
-    read = Sensor(position_resolution=1e-6, position_noise=3e-7, force_noise=0.03)
-    machine = Machine(inertia=true["inertia"], actuator_gain=226.19, effects=effects)
-    setup = Setup(machine, law, read, rate=1000.0, duration=seconds, seed=seed)
+        t = np.arange(round(1000 * base.duration)) / 1000.0
+        force = multisine(t, [0.3, 0.8, 1.9, 3.7], 1.2 * rng.uniform(0.9, 1.1), seed)
+        law = Loop(kind="open_loop", input=force)
+    setup = dataclasses.replace(base, machine=machine, loop=law)
     run = setup.run()
     text = case_text(
         setup, list(effects.items()), sensor=sensor == "stated", closed=loop == "known", true=True

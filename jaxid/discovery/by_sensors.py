@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from jaxid.discovery.candidates import Candidate
 from jaxid.discovery.screen import screen_candidates
 from jaxid.discovery.search import CERTAIN, MOST_OF_IT, NEARLY_ALL, Model, Search, Step
 from jaxid.discovery.selection import shortlist
@@ -32,8 +31,7 @@ def add_by_sensors(search: Search, steps: list[Step], most: int) -> list[Step]:
     if most < 1 or search.acceptance.at_floor(old.theta):
         return steps
     search.progress("searching for effects that leave nothing but noise")
-    first = next((s.added.candidate for s in steps if s.added), None)
-    for model in _begun(search, most, first):
+    for model in _begun(search, most):
         if _is_certain(search, model) and _is_better(search, model, old):
             names = " and ".join(c.label for c in model.added)
             why = f"{names} explain{'s' if len(model.added) == 1 else ''} what it stood for"
@@ -41,11 +39,8 @@ def add_by_sensors(search: Search, steps: list[Step], most: int) -> list[Step]:
     return steps
 
 
-def _begun(search: Search, most: int, first: Candidate | None) -> Iterator[Model]:
-    """Yield models of one effect that explain a log, and those that grow from one that explains much.
-
-    The search itself has grown what begins with its first effect.
-    """
+def _begun(search: Search, most: int) -> Iterator[Model]:
+    """Yield models of one effect that explain a log, and those that grow from one that explains much."""
     base = Model((), search.baseline)
     screened = screen_candidates(search, base, by_sensors=True)
     for score in shortlist([s for s in screened.scores if s.evidence > screened.threshold]):
@@ -55,7 +50,7 @@ def _begun(search: Search, most: int, first: Candidate | None) -> Iterator[Model
         model = Model((found.candidate,), found.refitted)
         if (closed := _closed(search, model)) > NEARLY_ALL:
             yield model
-        elif closed > MOST_OF_IT and found.candidate is not first:
+        elif closed > MOST_OF_IT:
             grown, _ = search.grow(model, most)
             if _closed(search, grown) > TAKES_OVER:
                 yield grown

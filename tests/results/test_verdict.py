@@ -26,8 +26,8 @@ from jaxid.results.verdict.completeness import (
     systematic_rms,
 )
 from jaxid.session import open_session
-from tests.support.slow_axis import DECLARED, STRIBECK, drag_axis, slow_axis
 from truth.axis.cases import case_text, write_case
+from truth.axis.slow_axis import DECLARED, STRIBECK, drag_axis, slow_axis
 
 
 def columns(setup):

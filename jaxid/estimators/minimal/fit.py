@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 _SETTLED = 0.1
 _PASSES = 4
 # Pairs of simulated noise for the shift of the coefficients by noise of the force, and the part of itself by
-# which one may move: up to 1 % where the values held, 14 % and more where the resonance was lost.
+# which one may move: about 1 % where the values held, 14 % and more where the resonance was lost.
 _PAIRS, _BIASED = 2, 0.05
 # Least number of samples per coefficient.
 _A_COEFFICIENT = 5
