@@ -29,6 +29,7 @@ from jaxid.names import METHODS, OUTPUTS, SEVERAL_LOGS, SOLVERS, USER_METHODS
 from jaxid.numerics.lanes import Precompile, Steps, run_alone, run_batched
 from jaxid.results.result import FitResult
 from jaxid.session import Logs, Session, open_session
+from jaxid.session.timing import states_timing
 
 
 @dataclass(frozen=True, repr=False)
@@ -229,9 +230,11 @@ def _tested(method: str, session: Session, options: Mapping[str, Any]) -> Steps[
         The session under the course of the force that the fit chose, and the fit.
     """
     more = {"scaled": True} if method == "output_error" else {}
+    if method == "prediction_error":
+        more["timing"] = not states_timing(session)
     estimate = yield from steps_of(method, session, **options, **more)
     if method != "inverse_dynamics" or session.more:
-        return (yield from with_force_course(session, method, estimate, options))
+        return (yield from with_force_course(session, method, estimate, {**options, **more}))
     return session, (yield from with_loop_noise(session, estimate))
 
 

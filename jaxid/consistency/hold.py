@@ -169,6 +169,17 @@ def under_smooth_force(
     return tuple(changed), f"lines: {reason}; {smooth}"
 
 
+def without_lines(findings: Sequence[Finding], gain: float) -> tuple[tuple[Finding, ...], str]:
+    """Return the findings and the reason of a held force when the log had chosen lines.
+
+    Args:
+        findings: Findings of the session, the choice of lines among them.
+        gain: Log-likelihood of a held force that was logged late minus that of lines [nats].
+    """
+    reason = f"held, and logged late, it raises the log-likelihood by {gain:.3g} over lines"
+    return tuple(f for f in findings if not f.what.startswith(_CHOSEN)), reason
+
+
 def hold_setting(before: str, other: str, gaps: np.ndarray, unit: str) -> dict[str, str]:
     """Return the entry of `settings` in result.json for a hold that was chosen from the log.
 

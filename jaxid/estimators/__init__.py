@@ -182,6 +182,7 @@ def _prediction_error(
     hessian: bool | None = None,
     profile: Sequence[str] | None = None,
     start: np.ndarray | None = None,
+    timing: bool = False,
 ) -> Steps[Estimate]:
     """Fit from the values of inverse dynamics, or from a start that is near the optimum."""
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
@@ -203,7 +204,7 @@ def _prediction_error(
     if session.more:
         return (yield from prediction_error_steps(machine, parts_of(session), **options))
     part = Part.alone(machine, run.log, run.data)
-    return (yield from prediction_error_steps(machine, [part], **options, **precision))
+    return (yield from prediction_error_steps(machine, [part], timing=timing, **options, **precision))
 
 
 def _whole(first: Estimate, machine: Machine) -> np.ndarray | None:

@@ -86,7 +86,10 @@ class Estimate:
         away = np.max([np.abs(theta - self.theta) for theta in others], axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             wider = 1 + away / (_INTERVAL * self.std)
-        factor = np.where(np.isfinite(wider), wider, 1.0)
+        return self.wider(np.where(np.isfinite(wider), wider, 1.0))
+
+    def wider(self, factor: Float[np.ndarray, " p"]) -> Estimate:
+        """Return the estimate with each standard deviation multiplied by a factor, (p,)."""
         beside = None if self.std_misspecified is None else self.std_misspecified * factor
         return replace(self, precision=self.precision.widened(factor), std_misspecified=beside)
 

@@ -1,7 +1,8 @@
-"""Choice of the force's course between samples by the likelihood of the innovations.
+"""Course of the force between samples, and its delay, by the likelihood of the innovations.
 
 Force gaps show whether a force is held. They do not show whether a force that is not held follows lines or a
-smooth curve, which shifts a fit by (angular frequency x period)^2 / 12 of the force.
+smooth curve, which shifts a fit by (angular frequency x period)^2 / 12 of the force. A held force that was
+logged late looks as one of lines does.
 """
 
 from __future__ import annotations
@@ -10,20 +11,23 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from jaxid.consistency.hold import EVIDENCE, under_smooth_force
+from jaxid.consistency.hold import EVIDENCE, under_smooth_force, without_lines
 from jaxid.estimators import steps_of
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.force_timing import timing_finding
 from jaxid.numerics.lanes import Steps
 from jaxid.session import Session
 from jaxid.session.holds import session_under_hold
+from jaxid.session.timing import session_with_force_at
 
-_LINES, _SMOOTH = "linear", "band_limited"
+_LINES, _SMOOTH, _STEPS = "linear", "band_limited", "zero_order"
+_WORDS = {_LINES: "lines", _SMOOTH: "a smooth curve", _STEPS: "steps"}
 
 
 def with_force_course(
     session: Session, method: str, estimate: Estimate, options: Mapping[str, Any]
 ) -> Steps[tuple[Session, Estimate]]:
-    """Fit again under a smooth force where the log chose lines, and return the fit that explains it better.
+    """Return the fit under the course of the force between samples that explains a log best.
 
     Args:
         session: Case and logs of the fit.
@@ -32,26 +36,61 @@ def with_force_course(
         options: Further arguments of `steps_of`.
 
     Returns:
-        The session under the better course, and its fit. If neither is clearly better, those of the fit,
-        with standard deviations widened so that the 95 % intervals hold the values of the other one.
+        The session under the best course, with the force at the time at which it acts, and the fit.
     """
-    chosen = session.settings.get("hold", {}).get("value") == _LINES
-    if method != "prediction_error" or not chosen or not estimate.converged:
+    if method != "prediction_error" or not estimate.converged:
         return session, estimate
-    other = session_under_hold(session, _SMOOTH)
-    again = yield from steps_of(method, other, start=estimate.theta, **options)
-    if not again.converged:
+    if session.settings.get("hold", {}).get("value") == _LINES:
+        session, estimate = yield from _of_best_course(session, method, estimate, options)
+    delay = estimate.details.get("force_delay")
+    if delay is None:
         return session, estimate
+    finding = timing_finding(delay, session.fit.log.source)
+    if delay["used"]:
+        return session_with_force_at(session, delay["value"], finding), estimate
+    return replace(session, findings=(*session.findings, finding)), estimate
 
-    # Both count the same samples, unless one of them knows when the machine sticks.
-    gain = again.details["log_likelihood"] - estimate.details["log_likelihood"]
-    if again.samples != estimate.samples or abs(gain) < EVIDENCE:
-        note = "whether the force follows lines or a smooth curve between samples is not known: the 95 % "
-        note += "intervals hold the values of both"
-        wider = estimate.holding(again.theta)
-        return session, replace(wider, notes=(*estimate.notes, note))
-    if gain < 0:
-        return session, estimate
-    found, reason = under_smooth_force(session.findings, session.settings["hold"]["reason"], gain)
-    settings = {**session.settings, "hold": {"value": _SMOOTH, "reason": reason}}
-    return replace(other, findings=found, settings=settings), again
+
+def _of_best_course(
+    session: Session, method: str, estimate: Estimate, options: Mapping[str, Any]
+) -> Steps[tuple[Session, Estimate]]:
+    """Fit again under other courses where the log chose lines, and return the best fit.
+
+    Lines stay unless another course is clearly better. Standard deviations are widened so that the 95 %
+    intervals hold the values under every course that is nearly as good.
+    """
+    tried = {_LINES: (session, estimate)}
+    late = "force_delay" in estimate.details
+    for hold in (_SMOOTH, _STEPS) if late else (_SMOOTH,):
+        other = session_under_hold(session, hold)
+        again = yield from steps_of(method, other, start=estimate.theta, **options)
+        if again.converged:
+            tried[hold] = (other, again)
+
+    # All count the same samples, unless one of them knows when the machine sticks.
+    gains = {
+        hold: again.details["log_likelihood"] - estimate.details["log_likelihood"]
+        if again.samples == estimate.samples
+        else 0.0
+        for hold, (_, again) in tried.items()
+    }
+    best = max(gains, key=lambda hold: gains[hold])
+    taken = _LINES if gains[best] < EVIDENCE else best
+    close = [hold for hold in tried if hold != taken and abs(gains[hold] - gains[taken]) < EVIDENCE]
+
+    found, fit = tried[taken]
+    reason = session.settings["hold"]["reason"]
+    if taken == _SMOOTH:
+        findings, reason = under_smooth_force(session.findings, reason, gains[taken])
+    elif taken == _STEPS:
+        findings, reason = without_lines(session.findings, gains[taken])
+    if taken != _LINES:
+        settings = {**session.settings, "hold": {"value": taken, "reason": reason}}
+        found = replace(found, findings=findings, settings=settings)
+    if close:
+        *first, last = (_WORDS[hold] for hold in (taken, *close))
+        note = f"whether the force follows {', '.join(first)} or {last} between samples is not known: the "
+        note += f"95 % intervals hold the values of {'both' if len(close) == 1 else 'all'}"
+        wider = fit.holding(*[tried[hold][1].theta for hold in close])
+        fit = replace(wider, notes=(*fit.notes, note))
+    return found, fit

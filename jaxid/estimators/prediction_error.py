@@ -18,13 +18,15 @@ from jaxid.estimators.common.best_bodies import NEAREST, nearest_bodies
 from jaxid.estimators.common.profile import need_names
 from jaxid.estimators.common.shapes import shape_starts
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.innovations import STEPS, hessian_steps, profile_steps
+from jaxid.estimators.force_timing import timing_steps
+from jaxid.estimators.innovations import hessian_steps, profile_steps
 from jaxid.estimators.joint_likelihood import (
     JointLikelihood,
     Maximum,
     Member,
 )
 from jaxid.estimators.likelihood import likelihood_of, needed_numerics
+from jaxid.estimators.noise_floors import maximum_steps
 from jaxid.estimators.several.parts import Part, by_log
 from jaxid.estimators.several.sums import stacked
 from jaxid.estimators.several.weights import disagreement
@@ -35,14 +37,12 @@ from jaxid.numerics.lanes import Steps, run_alone
 from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.precision import FISHER, FULL_HESSIAN, Precision, hessian_notes
 from jaxid.numerics.rows import Rows, assess_together
-from jaxid.numerics.whiteness import LAGS, band_of_half_the_excess, whiteness
+from jaxid.numerics.whiteness import LAGS, REJECTS, band_of_half_the_excess, whiteness
 from jaxid.simulation.replay import Numerics
 from jaxid.simulation.sensor_noise import force_noise
 
 # Evaluations that show which start is the best one.
 _SCREENING = 12
-# Probability at which the test of whiteness rejects.
-_REJECTS = 1e-3
 
 
 def prediction_error(
@@ -117,6 +117,7 @@ def prediction_error_steps(
     alone: bool = False,
     hessian: bool = False,
     profile: Sequence[str] = (),
+    timing: bool = False,
 ) -> Steps[Estimate]:
     """Run `prediction_error` as a generator of solve requests.
 
@@ -124,6 +125,8 @@ def prediction_error_steps(
         machine: Machine of all logs, with their unknowns.
         log: The log, or the parts of several, whose `rest_velocity` and `command_noise` are those of each.
         start, numerics, rest_velocity, command_noise, alone, hessian, profile: See `prediction_error`.
+        timing: Whether the delay of the force of one log is estimated, see `timing_steps`; it then stands
+            under `force_delay` in the details.
 
     Raises:
         InputError: Those of `prediction_error`; or `hessian` or `profile` is asked for with several logs.
@@ -139,8 +142,11 @@ def prediction_error_steps(
 
     fit = _joined(_without_bodies(machine), settings, start, numerics)
     theta, noises, screened = yield from _best_start(fit, start, alone=alone)
-    fit, lowest = yield from _by_floors(fit, theta, noises)
-    fit, end = yield from _with_samples_at_rest(fit, lowest)
+    logged = fit
+    fit, end = yield from maximum_steps(logged, theta, noises)
+    late = None
+    if timing and len(settings) == 1:
+        fit, end, late = yield from timing_steps(logged, fit, end)
     end = replace(end, steps=screened + end.steps)
 
     found = Corrected.not_at_all(end.theta, [m.drives for m in fit.members])
@@ -156,7 +162,7 @@ def prediction_error_steps(
         estimate = yield from _by_hessian(estimate, fit, end, found)
     if profile:
         estimate = yield from _with_profiles(estimate, fit, end, found.theta, profile)
-    return estimate
+    return estimate if late is None else late.noted(estimate, settings[0][0].log.period)
 
 
 def _without_bodies(machine: Machine) -> Machine:
@@ -218,58 +224,6 @@ def _best_start(
         trials.append((yield from fit.fit(at, noises, _SCREENING)))
     best = min(trials, key=lambda trial: np.nan_to_num(trial.cost, nan=np.inf))
     return best.theta, best.noises, sum(trial.steps for trial in trials)
-
-
-def _by_floors(
-    fit: JointLikelihood, theta: np.ndarray, noises: list[np.ndarray]
-) -> Steps[tuple[JointLikelihood, Maximum]]:
-    """Maximise under one floor of the noise after the other, until the noise is above its floor.
-
-    Returns:
-        The likelihood under the last floor, and its maximum with the steps of all.
-    """
-    end, steps = None, 0
-    for floor in range(len(fit.members[0].at.floors)):
-        fit = fit.at_floor(floor)
-        end = yield from fit.fit(theta, noises, STEPS)
-        theta, noises, steps = end.theta, end.noises, steps + end.steps
-        if fit.above(floor, end) or not np.isfinite(end.cost):
-            break
-    assert end is not None, "there is at least one floor"
-    return fit, replace(end, steps=steps)
-
-
-def _with_samples_at_rest(fit: JointLikelihood, end: Maximum) -> Steps[tuple[JointLikelihood, Maximum]]:
-    """Count the samples at rest too, in the logs in which it is known when a joint sticks.
-
-    It is known without noise of the force. If the noise rises with these samples, it holds the error of the
-    steps in which a joint comes to rest: then they do not count.
-    """
-    steps, sure = end.steps, fit.sticks_surely(end.noises)
-    while any(sure):
-        rested = fit.at_rest_too(sure)
-        other = yield from rested.fit(end.theta, end.noises, STEPS)
-        steps += other.steps
-        still = [s and after for s, after in zip(sure, fit.sticks_surely(other.noises), strict=True)]
-        if still == sure:
-            return (yield from _quieter(rested, replace(other, steps=steps)))
-        sure = still
-    return fit, replace(end, steps=steps)
-
-
-def _quieter(fit: JointLikelihood, end: Maximum) -> Steps[tuple[JointLikelihood, Maximum]]:
-    """Return a fit whose noise of the force came to its floor with a lower one, if it converges there too.
-
-    The standard deviations are those of the noise at the floor, and too large by as much as it is too high.
-    """
-    quiet = fit.at_quietest()
-    if quiet is None or not end.converged or fit.above(-1, end):
-        return fit, end
-    other = yield from quiet.fit(end.theta, end.noises, STEPS)
-    steps = end.steps + other.steps
-    if not other.converged:
-        return fit, replace(end, steps=steps)
-    return quiet, replace(other, steps=steps)
 
 
 def _with_bound_at_truth(
@@ -361,7 +315,7 @@ def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estim
             "if this arm ran in a loop, its intervals are too narrow: fewer than 95 % held in trials "
             "without a declared loop (docs/methods.md); declare [controller] and reference if they are known"
         )
-    if min(min(entry["whiteness"]["p"]) for entry in entries) < _REJECTS:
+    if min(min(entry["whiteness"]["p"]) for entry in entries) < REJECTS:
         notes.append(
             f"the innovations are not white{_bands(fit, rows)} (rounding, coloured noise or an incomplete "
             "model): the standard deviations are widened accordingly"
@@ -398,7 +352,7 @@ def _bands(fit: JointLikelihood, rows: Sequence[Rows]) -> str:
         band_of_half_the_excess(np.where(c, e, 0.0), 1 / member.part.log.period)
         for member, row in zip(fit.members, rows, strict=True)
         for e, c in zip(row.residual.T, row.counts.T, strict=True)
-        if whiteness(e[c]) < _REJECTS
+        if whiteness(e[c]) < REJECTS
     ]
     found = [band for band in bands if band is not None]
     if len(found) != 1:

@@ -26,7 +26,7 @@ def taken_back(
         InputError: If a time is stated for a column that the log does not have, or is longer than the log.
     """
     out = dict(groups)
-    for key, change in (("lag", _without_low_pass), ("delay", _earlier)):
+    for key, change in (("lag", _without_low_pass), ("delay", earlier)):
         for quantity, stated in dict(getattr(table, key) or {}).items():
             if table.force is None:
                 hint = f"add the column, or leave out {key}.{quantity}"
@@ -54,13 +54,15 @@ def _by_column(stated: float | tuple[float, ...], width: int, name: str, where: 
     return times
 
 
-def _earlier(time: np.ndarray, x: np.ndarray, delay: float, hold: str | None) -> np.ndarray:
-    """Return a signal as it will be read after a delay; the last reading stays.
+def earlier(
+    time: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], delay: float, hold: str | None
+) -> Float[np.ndarray, " samples"]:
+    """Return a signal as it will be read after a delay; readings beyond the ends are those at the ends.
 
     Between samples of a held force lines give the mean of what was held over a sample; of one that is not
     held they would damp what is fast, so that it follows cubic splines.
     """
-    then = np.minimum(time + delay, time[-1])
+    then = np.clip(time + delay, time[0], time[-1])
     if hold in (None, "zero_order"):
         return np.interp(then, time, x)
     import scipy.interpolate  # a third of a second, which reading another log does not need

@@ -7,8 +7,8 @@ import scipy.signal
 import scipy.stats
 from jaxtyping import Float
 
-# Lags of the test.
-LAGS = 20
+# Lags of the test, and the probability at which it rejects.
+LAGS, REJECTS = 20, 1e-3
 # Bins of the spectrum at the least, samples of a segment at the most, and the widest band that is one.
 _FEWEST_BINS, _SEGMENT, _WIDEST = 16, 512, 0.2
 # Factor over the median of the spectrum beyond which a bin is no scatter of white noise, and the least part

@@ -80,11 +80,22 @@ def open_log(
     """
     on_log = machine if values is None else values.machine(machine)
     log = recipe.cleaned(log)
-    data = _prepare(log, on_log, recipe, needed)
+    data = prepared(log, on_log, recipe, needed)
     return OpenedLog(name, log, data, disturbance, reference_hold, values)
 
 
-def _prepare(log: Log, machine: Machine, recipe: Recipe, needed: int) -> Prepared:
+def prepared(log: Log, machine: Machine, recipe: Recipe, needed: int = 0) -> Prepared:
+    """Return a cleaned log, prepared by a recipe.
+
+    Args:
+        log: The log.
+        machine: Its machine.
+        recipe: Filtering of the log.
+        needed: Samples of motion that the log must have.
+
+    Raises:
+        InputError: If the log is too short, or moves too little.
+    """
     remaining = log.samples // recipe.decimation - 2 * recipe.trim
     if remaining * log.position.shape[1] < needed:
         raise InputError(

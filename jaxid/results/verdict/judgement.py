@@ -11,6 +11,7 @@ from jaxid.consistency.absent import known_forces
 from jaxid.consistency.late_force import LateForce
 from jaxid.consistency.law import law_of_rows
 from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.force_timing import delay_words
 from jaxid.gap import Gap
 from jaxid.machine import Machine
 from jaxid.results.report.numbers import percent, plain, scaled_unit
@@ -30,6 +31,8 @@ _CLEARLY = 1.3
 _FAR = 10.0
 # A model that leaves this part of the force explains nothing: the log's columns are in doubt first.
 _NOTHING = 0.9
+# Delay of the force in samples below which it is a note only.
+_SLIGHT = 0.05
 # Most sentences on single values; further ones are counted.
 _MOST = 6
 
@@ -94,6 +97,7 @@ def judge(
 
     findings = _scale_words(session)
     findings += [] if estimate.converged else [f"The fit did not converge: {estimate.message}."]
+    findings += _delay_words(estimate)
     findings += [] if late is None else late.findings
     findings += [f"The fit contradicts the case: {r.text}." for r in contrary]
     if against:
@@ -130,6 +134,20 @@ def _scale_words(session: Session) -> list[str]:
     return [
         f"Nothing drives the machine, so all values are in proportion to {listed}, which the log cannot "
         "check. If it is an assumption, only the ratios of the values hold."
+    ]
+
+
+def _delay_words(estimate: Estimate) -> list[str]:
+    """Return a sentence on a delay of the force that was estimated, or that the log asks for."""
+    delay = estimate.details.get("force_delay")
+    if delay is None or abs(delay["samples"]) < _SLIGHT:
+        return []
+    how = delay_words(delay)
+    if delay["used"]:
+        return [f"The force is taken as logged {how}, which was estimated with the unknowns."]
+    return [
+        f"The force seems to be logged {how}: that is too long to be taken for timing, and the values are "
+        "those of the log as it is."
     ]
 
 
