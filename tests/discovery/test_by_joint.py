@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 import jaxid
+from benchmarks.unforced import of as machine_of
 from jaxid.discovery.in_loop import unforced
 from jaxid.discovery.in_loop.by_joint import ArmSearch, explore_by_joint, joint_words
+from jaxid.discovery.in_loop.whole_arm import without_unneeded
+from jaxid.discovery.result import Discovery
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.estimators.apart.joint import joints_alone
@@ -241,3 +244,39 @@ def test_a_complete_arm_gets_nothing():
     d = searched(servo_arm_case(dry()), servo_arm_log(seed=5))
     assert d.kinds == []
     assert np.all(d.gaps[0].simulation.rms < 3e-4)
+
+
+def test_effects_of_joints_that_the_declared_model_explains_are_left_out():
+    def search(kind: str) -> Discovery:
+        effect = SimpleNamespace(kind=kind, score=SimpleNamespace(evidence=66.2))
+        fields = dict.fromkeys(("session", "where", "noise_floor"))
+        return Discovery(
+            **fields,
+            verdict="found",
+            effects=(effect,),
+            rounds=("first", "second"),
+            before="declared",
+            after="with it",
+            gaps_before=("large",),
+            gaps_after=("small",),
+        )
+
+    found = {0: search("stribeck_friction"), 1: search("load_friction")}
+    kept, notes = without_unneeded(found, {0})
+    assert kept[0] is found[0]
+    assert (kept[1].effects, kept[1].rounds, kept[1].after) == ((), ("first",), "declared")
+    assert kept[1].gaps_after == ("large",)
+    (note,) = notes
+    assert note.startswith("load_friction[2] was not added, at 66 nats for the joint alone")
+    assert without_unneeded(found, {0, 1}) == (found, ())
+
+
+@pytest.mark.slow
+def test_what_one_joint_alone_lacks_is_no_effect_of_the_whole_arm():
+    """Alone, the second joint of this complete arm asks for load friction."""
+    drawn = machine_of("arm_nulls", 4)
+    d = jaxid.discover(drawn.case(), drawn.columns())
+    assert d.verdict == "nothing_missing"
+    assert any(note.startswith("load_friction[2] was not added") for note in d.after.notes)
+    truth = np.array([drawn.truth()[name] for name in d.after.names])
+    assert np.all(np.abs(d.after.theta - truth) < 3 * d.after.std)

@@ -23,6 +23,7 @@ from jaxid.discovery.in_loop.unforced import (
     verdict_without_effects,
     where_in_time,
 )
+from jaxid.discovery.in_loop.whole_arm import declared_by_whole, without_unneeded
 from jaxid.discovery.result import Discovery, NamedEffect, Round
 from jaxid.discovery.score import Score
 from jaxid.errors import InputError
@@ -81,7 +82,18 @@ def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[
             at_joint("simulating the arm with what was found")
             arm, found = arm.settled(found)
     progress("simulating the whole arm")
-    return arm.together({joint: found[joint] for joint in sorted(found)})
+    found = {joint: found[joint] for joint in sorted(found)}
+    together = arm.together(found)
+    if together.verdict == "nothing_missing":
+        return together
+    checked = declared_by_whole(session, together.before, progress)
+    if checked is None:
+        return together
+    whole, needed = checked
+    kept, notes = without_unneeded(found, needed)
+    if not needed:
+        return arm.together(kept, whole, notes)
+    return arm.together(kept, notes=notes) if notes else together
 
 
 @dataclass(frozen=True)
@@ -248,19 +260,24 @@ class ArmSearch:
             own, before, max_effects=max_effects, progress=progress, effort=FEW, judged=False
         )
 
-    def together(self, found: Mapping[int, Discovery]) -> Discovery:
+    def together(
+        self, found: Mapping[int, Discovery], whole: Estimate | None = None, notes: tuple[str, ...] = ()
+    ) -> Discovery:
         """Return what was found at the joints as the discovery of the arm, simulated as a whole.
 
         Args:
             found: Search of each joint that was searched, as it came.
+            whole: Fit of the declared model to the whole arm, where nothing was found; None: there is none.
+            notes: Remarks for a user.
         """
         session, machine = self.session, self.session.machine
         final, names = _with_effects(machine, found)
         known = {joint: found[joint].before if joint in found else e for joint, e in self.declared.items()}
-        before = of_arm(machine, self.parts, self.every, known)
+        before = whole or of_arm(machine, self.parts, self.every, known)
         known |= {joint: d.after for joint, d in found.items()}
         fuller = [_fuller(alone, final, found, names) for alone in self.every]
-        after = of_arm(final, self.parts, fuller, known)
+        after = whole or of_arm(final, self.parts, fuller, known)
+        after = replace(after, notes=(*after.notes, *notes))
         joints = {joint: _at_joint(session, joint, d, names[joint]) for joint, d in found.items()}
         effects = tuple(effect for d in joints.values() for effect in d.effects)
 
