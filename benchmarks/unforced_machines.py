@@ -63,7 +63,7 @@ class Servo:
         """Run the exact stepper; `exact` switches the encoder's errors off, changes replace fields."""
         servo = dataclasses.replace(self, **changes)
         ticks = np.repeat(servo.command, servo.every)
-        if "joint_flexibility" in servo.effects:
+        if "joint_flexibility" in servo.effects or "backlash" in servo.effects:
             return servo._run_flexible(ticks, exact=exact)
         loop = Loop(kind="pd", kp=servo.kp, kd=servo.kd, reference=ticks)
         return simulate(
@@ -79,15 +79,18 @@ class Servo:
         )
 
     def _run_flexible(self, ticks: np.ndarray, *, exact: bool) -> dict[str, np.ndarray]:
-        """Run the exact chain: the encoder's inertia, and the rest of it behind a spring."""
+        """Run the exact chain: the encoder's inertia, and the rest of it behind a spring or in play."""
         effects = {kind: dict(values) for kind, values in self.effects.items()}
-        spring = effects.pop("joint_flexibility")
+        spring = effects.pop("joint_flexibility", None) or effects.pop("backlash")
         load, viscous = spring["load_inertia"], effects["viscous_friction"]["coefficient"]
+        acting = {("coulomb_friction", 1): effects["coulomb_friction"]}
+        if "gap" in spring:
+            acting["backlash", 2] = {"gap": spring["gap"]}
         machine = ChainMachine(
             (self.inertia - load, load),
             (viscous, 0.0),
             (0.0, spring["stiffness"], 0.0),
-            effects={("coulomb_friction", 1): effects["coulomb_friction"]},
+            effects=acting,
             actuated=(1,),
             coupling=(0.0, spring["damping"], 0.0),
         )
@@ -232,6 +235,15 @@ def _values(kind: str, made: Servo, rng: np.random.Generator) -> dict[str, float
     if kind == "saturation":
         peak = float(np.abs(made.run(exact=True)["true_force"]).max())
         return {"limit": peak * rng.uniform(0.45, 0.85)}
+    if kind == "voltage_limit":
+        run = made.run(exact=True)
+        force, speed = (float(np.abs(run[name]).max()) for name in ("true_force", "true_velocity"))
+        return {"stall": force * rng.uniform(0.8, 1.5), "velocity": speed * rng.uniform(0.7, 1.1)}
+    if kind == "backlash":
+        load = made.inertia * rng.uniform(0.3, 0.7)
+        turn = 2 * np.pi * min(40.0, made.rate / 10)
+        values = {"stiffness": load * turn**2, "damping": 0.4 * load * turn, "gap": rng.uniform(0.01, 0.06)}
+        return {name: float(value) for name, value in {**values, "load_inertia": load}.items()}
     if kind == "joint_flexibility":
         load = made.inertia * rng.uniform(0.3, 0.7)
         turn = 2 * np.pi * rng.uniform(5.0, min(20.0, made.rate / made.every / 10))
@@ -267,4 +279,6 @@ HIDDEN = (
     "load_friction",
     "linear_stiffness",
     "joint_flexibility",
+    "backlash",
+    "voltage_limit",
 )

@@ -31,6 +31,7 @@ class Backlash(Effect):
     of_spring = True
     with_springs = True
     opens_spring = True
+    without_force = True
 
     gap: Array = parameter("position", "positive", "total clearance")
 
@@ -103,3 +104,37 @@ class JointFlexibility(Effect):
             w = 2 * np.pi / (samples * scales.period)
             found.append({"stiffness": inertia * w**2, "damping": 0.4 * inertia * w, "load_inertia": inertia})
         return found
+
+
+class BacklashOfJoint(JointFlexibility):
+    """Part of the inertia, J, follows through a clearance and the spring behind it.
+
+    It is `joint_flexibility` with a gap, as which a case states it: backlash of a joint that has no spring. A
+    stiff spring only says how hard the load strikes, so that its stiffness is seldom identifiable.
+    """
+
+    title = "backlash"
+    formula = "as joint_flexibility, less a dead zone of gap in the elongation"
+
+    kind = "backlash"
+    case_kind = JointFlexibility.kind
+
+    gap: Array = parameter("position", "positive", "total clearance in series with the spring")
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        # Clearances over the stroke, each before a soft and a stiff contact with half of the inertia.
+        inertia, found = 0.5 * scales.natural("inertia"), []
+        for gap in (0.003, 0.01, 0.03, 0.1):
+            for samples in (4.0, 10.0):
+                w = 2 * np.pi / (samples * scales.period)
+                spring = {"stiffness": inertia * w**2, "damping": 0.4 * inertia * w, "load_inertia": inertia}
+                found.append({**spring, "gap": gap * scales.position})
+        return found
+
+    @classmethod
+    def limits(cls, scales: Scales) -> dict[str, tuple[float, float]]:
+        return {"gap": (0.0, scales.position)}
+
+
+Backlash.of_joint = BacklashOfJoint

@@ -220,6 +220,10 @@ class Effect(eqx.Module):
     drive_gain: ClassVar[str | None] = None
     # Whether it puts a part of the inertia behind an additional spring, so that the machine resonates.
     adds_spring: ClassVar[bool] = False
+    # Class of the same effect at a joint of a plant without springs; None: there is none.
+    of_joint: ClassVar[type[Effect] | None] = None
+    # Kind as which a case states it, where that is another one than results use; None: it is the same.
+    case_kind: ClassVar[str | None] = None
     # Whether it lets a spring of the plant pass no force in a part of its range (a clearance).
     opens_spring: ClassVar[bool] = False
 

@@ -439,6 +439,8 @@ def _table(
 
 def _kind(cls: type[Effect], case: Case, tables: Mapping) -> str:
     """Return the text by which a case names an effect: a kind, or a class in a file."""
+    if cls.case_kind is not None:
+        return cls.case_kind
     if EFFECTS.get(cls.kind) is cls:
         return cls.kind
     named = zip(case.candidates, tables.get("discover", {}).get("candidates", ()), strict=True)

@@ -141,6 +141,10 @@ def searched(session: Session, machine: Machine) -> list[type[Effect]]:
         for kind, cls in EFFECTS.items()
         if (kind in case.kinds if case.kinds else cls.without_force or kind in asked)
     ]
+    rigid = not machine.plant.springs(machine.plant.joints)
+    kinds = [cls.of_joint if rigid and cls.of_joint is not None else cls for cls in kinds]
+    if any(e.adds_spring for e in machine.plant.effects):
+        kinds = [cls for cls in kinds if not cls.adds_spring]
     followed = [c for c in (*kinds, *case.own_effects) if c.break_away_level is None and not c.opens_spring]
     law = machine.controller
     apart = [c for c in followed if c.duplicates_field is None or getattr(law, c.duplicates_field) is None]

@@ -1,0 +1,61 @@
+"""Backlash of a servo without a force, between a motor with its encoder and its load: exact stepper."""
+
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+import jaxid
+from benchmarks.unforced_machines import servo
+from jaxid.discovery.in_loop.unforced import searched
+from jaxid.effects.coupling import Backlash, BacklashOfJoint, JointFlexibility
+from jaxid.model.effect import Signals
+from jaxid.session import open_session
+
+VALUES = {"stiffness": 60.0, "damping": 0.2, "load_inertia": 3e-3, "gap": 0.03}
+SPRING = {"kind": "joint_flexibility", **VALUES}
+
+
+def session(**changes):
+    drawn = servo(1)
+    return open_session(drawn.case() | changes, drawn.columns())
+
+
+def test_it_is_the_flexible_joint_with_a_gap():
+    state, given = np.array([0.4, 0.7]), dict.fromkeys((f.name for f in fields(Signals)), 0.3)
+    one, other = (cls(**VALUES).act(Signals(**given), state) for cls in (BacklashOfJoint, JointFlexibility))
+    assert one.force == other.force
+    assert np.array_equal(one.rate, other.rate)
+
+
+def test_a_search_without_a_force_tries_it_at_joints_without_a_spring():
+    plain = session()
+    assert BacklashOfJoint in searched(plain, plain.machine)
+    assert Backlash not in searched(plain, plain.machine)
+
+    sprung = session(effects=[SPRING])
+    assert BacklashOfJoint not in searched(sprung, sprung.machine)
+
+
+def test_it_can_be_asked_for_alone():
+    asked = session(discover={"kinds": ["backlash"]})
+    assert searched(asked, asked.machine) == [BacklashOfJoint]
+
+
+@pytest.mark.slow
+def test_backlash_is_named_alone_with_its_gap(tmp_path):
+    drawn = servo(1, "backlash")
+    found = jaxid.discover(drawn.case(), drawn.columns())
+    assert found.kinds == ["backlash"]
+    assert not found.effects[0].alternatives
+    true = drawn.effects["backlash"]
+    for name in ("gap", "load_inertia", "stiffness"):
+        assert found.parameters[f"backlash.{name}"].value == pytest.approx(true[name], rel=0.05)
+
+    found.save(tmp_path / "out")
+    content = json.loads((tmp_path / "out/discovery.json").read_text())
+    assert content["effects"][0]["kind"] == "backlash"
+    again = jaxid.load_case(tmp_path / "out/case.toml")
+    (effect,) = [e for e in again.effects if e.cls is JointFlexibility]
+    assert set(effect.parameters) == set(VALUES)
