@@ -23,6 +23,8 @@ RATES = ((1000.0, 1), (1000.0, 10), (500.0, 5), (200.0, 4))
 VISIBLE = 30.0
 # Longest integration step of the oracle's runs [s].
 COARSE = 4e-5
+# Effects for which a search must be asked.
+ASKED = ("backlash", "voltage_limit")
 # Declared unknowns of the machine, by the key of the exact stepper's effects.
 DECLARED = {"viscous_friction": "coefficient", "coulomb_friction": "level"}
 
@@ -142,7 +144,8 @@ class Servo:
             for kind, name in DECLARED.items()
             if kind in self.declared
         ]
-        return {
+        asked = {"discover": {"candidates": [self.hidden]}} if self.hidden in ASKED else {}
+        return asked | {
             "plant": {"kind": "axis", "motion": "rotary", "parameters": {"inertia": guess(self.inertia)}},
             "effects": effects,
             "controller": controller,

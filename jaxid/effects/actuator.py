@@ -218,8 +218,6 @@ class VoltageLimit(Effect):
     met = "small servos and battery drives at high speed"
     part = "drive"
 
-    without_force = True
-
     adds_force = False
     in_drive = True
     on_request = True

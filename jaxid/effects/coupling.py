@@ -31,7 +31,6 @@ class Backlash(Effect):
     of_spring = True
     with_springs = True
     opens_spring = True
-    without_force = True
 
     gap: Array = parameter("position", "positive", "total clearance")
 

@@ -242,7 +242,8 @@ class _Loop:
     def squares(self, noise: ReadingNoise) -> Float[np.ndarray, " n"]:
         """Return the sum of squares that mean readings of the first draws leave of the log, by joint."""
         off = self.log.filled - self._mean(noise, self.draws[0])
-        return np.nan_to_num(np.sum(np.where(self.log.measured, off, 0.0) ** 2, axis=0), nan=np.inf)
+        with np.errstate(over="ignore", invalid="ignore"):  # of a loop that diverges
+            return np.nan_to_num(np.sum(np.where(self.log.measured, off, 0.0) ** 2, axis=0), nan=np.inf)
 
     def at_best_level(self, noise: ReadingNoise, levels: list[np.ndarray]) -> ReadingNoise:
         """Return the noise with the level of each joint at which its mean readings are nearest to the log."""
@@ -262,6 +263,8 @@ class _Loop:
         nudge = noise.nudge
         off, columns = rows(nudge)
         for _ in range(_STEPS):
+            if not (np.all(np.isfinite(off)) and np.all(np.isfinite(columns))):
+                break  # the loop diverges at these values
             size = np.linalg.norm(columns, axis=0) + 1e-300
             new = nudge + np.linalg.lstsq(columns / size, off, rcond=1e-6)[0] / size
             after, slope = rows(new)

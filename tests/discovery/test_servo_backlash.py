@@ -1,17 +1,20 @@
 """Backlash of a servo without a force, between a motor with its encoder and its load: exact stepper."""
 
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 import jaxid
 from benchmarks.unforced_machines import servo
-from jaxid.discovery.in_loop.unforced import searched
+from jaxid.discovery.in_loop.unforced import _not_asked, searched
 from jaxid.effects.coupling import Backlash, BacklashOfJoint, JointFlexibility
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.model.effect import Signals
 from jaxid.session import open_session
+from jaxid.simulation.noisy_loop import estimated_noise
+from jaxid.simulation.replay import make_replay
 
 VALUES = {"stiffness": 60.0, "damping": 0.2, "load_inertia": 3e-3, "gap": 0.03}
 SPRING = {"kind": "joint_flexibility", **VALUES}
@@ -29,13 +32,33 @@ def test_it_is_the_flexible_joint_with_a_gap():
     assert np.array_equal(one.rate, other.rate)
 
 
-def test_a_search_without_a_force_tries_it_at_joints_without_a_spring():
+def test_a_search_without_a_force_tries_it_on_request_at_joints_without_a_spring():
     plain = session()
-    assert BacklashOfJoint in searched(plain, plain.machine)
-    assert Backlash not in searched(plain, plain.machine)
+    assert BacklashOfJoint not in searched(plain, plain.machine)
+    asked = session(discover={"candidates": ["backlash"]})
+    assert BacklashOfJoint in searched(asked, asked.machine)
+    assert Backlash not in searched(asked, asked.machine)
 
-    sprung = session(effects=[SPRING])
+    sprung = session(effects=[SPRING], discover={"candidates": ["backlash"]})
     assert BacklashOfJoint not in searched(sprung, sprung.machine)
+
+
+def test_what_was_not_tried_is_named():
+    (note,) = _not_asked(session())
+    assert note.startswith("not tried: backlash and voltage_limit; name them in candidates")
+    (note,) = _not_asked(session(discover={"candidates": ["voltage_limit"]}))
+    assert note.startswith("not tried: backlash; name")
+    assert _not_asked(session(discover={"candidates": ["voltage_limit", "backlash"]})) == []
+
+
+def test_noise_in_a_loop_that_diverges_has_no_start():
+    """It ended in a traceback of the decomposition."""
+    one = session()
+    machine = one.machine
+    wild = replace(machine, controller=replace(machine.controller, kp=np.full(1, 1e9), kd=np.zeros(1)))
+    replay = make_replay(wild, one.fit.log, choose_numerics(wild, one.fit.log))
+    noise = estimated_noise(wild, one.fit.log, replay, follows=False)
+    assert noise is None or not np.all(np.isfinite(noise.shift))
 
 
 def test_it_can_be_asked_for_alone():
@@ -46,7 +69,7 @@ def test_it_can_be_asked_for_alone():
 @pytest.mark.slow
 def test_backlash_is_named_alone_with_its_gap(tmp_path):
     drawn = servo(1, "backlash")
-    found = jaxid.discover(drawn.case(), drawn.columns())
+    found = jaxid.discover(drawn.case() | {"discover": {"candidates": ["backlash"]}}, drawn.columns())
     assert found.kinds == ["backlash"]
     assert not found.effects[0].alternatives
     true = drawn.effects["backlash"]

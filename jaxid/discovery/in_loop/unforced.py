@@ -48,6 +48,8 @@ from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import Numerics, Replay, make_replay
 from jaxid.simulation.sensor_noise import position_noise
 
+# Effects of servos that take long to search, or seldom act.
+_ASKED = ("backlash", "voltage_limit")
 UNSEEN = "a log without a force is compared in the simulated loop, which follows no jump at break-away"
 # Samples of the window in which the residual is loudest, as a part of the log.
 _WINDOW = 0.02
@@ -112,6 +114,8 @@ def explored_from(
     verdict = "found"
     if not effects:
         verdict = verdict_without_effects(judged and bool(open_joints(session, before.machine, old)))
+    if verdict == "unexplained":
+        after = replace(after, notes=(*after.notes, *_not_asked(session)))
     return Discovery(
         session=session,
         verdict=verdict,
@@ -125,6 +129,15 @@ def explored_from(
         noise_floor=np.full(session.machine.plant.joints, np.nan),
         unseen=UNSEEN,
     )
+
+
+def _not_asked(session: Session) -> list[str]:
+    """Return a note on effects that were not tried because nobody asked for them."""
+    asked = {*session.case.kinds, *(cls.kind for cls in session.case.candidates)}
+    left = [kind for kind in _ASKED if kind not in asked]
+    if not left:
+        return []
+    return [f"not tried: {' and '.join(left)}; name them in candidates of [discover] to search for them"]
 
 
 def searched(session: Session, machine: Machine) -> list[type[Effect]]:
