@@ -79,12 +79,13 @@ def _of_best_course(
     close = [hold for hold in tried if hold != taken and abs(gains[hold] - gains[taken]) < EVIDENCE]
 
     found, fit = tried[taken]
-    reason = session.settings["hold"]["reason"]
-    if taken == _SMOOTH:
-        findings, reason = under_smooth_force(session.findings, reason, gains[taken])
-    elif taken == _STEPS:
-        findings, reason = without_lines(session.findings, gains[taken])
     if taken != _LINES:
+        before = session.settings["hold"]["reason"]
+        findings, reason = (
+            under_smooth_force(session.findings, before, gains[taken])
+            if taken == _SMOOTH
+            else without_lines(session.findings, gains[taken])
+        )
         settings = {**session.settings, "hold": {"value": taken, "reason": reason}}
         found = replace(found, findings=findings, settings=settings)
     if close:
