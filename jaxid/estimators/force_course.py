@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from jaxid.consistency.hold import EVIDENCE, under_smooth_force, without_lines
+from jaxid.consistency.timing import SEEMS
 from jaxid.estimators import steps_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.force_timing import timing_finding
@@ -46,6 +47,8 @@ def with_force_course(
     if delay is None:
         return session, estimate
     finding = timing_finding(delay, session.fit.log.source)
+    others = tuple(f for f in session.findings if not f.what.startswith(SEEMS))
+    session = replace(session, findings=others)
     if delay["used"]:
         return session_with_force_at(session, delay["value"], finding), estimate
     return replace(session, findings=(*session.findings, finding)), estimate

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.consistency.hold import EVIDENCE
+from jaxid.consistency.timing import SEEMS
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.innovations import STEPS
 from jaxid.estimators.joint_likelihood import JointLikelihood, Maximum
@@ -215,8 +216,8 @@ def timing_finding(delay: Mapping[str, Any], source: str) -> Finding:
     if delay["value"] > 0:
         hint = f"state delay = {{ force = {delay['value']:.3g} }} in [log]"
     hint += " to confirm it" if delay["used"] else ", if the log was recorded so"
-    taken = "is taken as" if delay["used"] else "seems to be"
-    what = f"the force {taken} logged {how}: it raises the log-likelihood by {delay['gain']:.3g}"
+    head = "the force is taken as logged" if delay["used"] else SEEMS
+    what = f"{head} {how}: it raises the log-likelihood by {delay['gain']:.3g}"
     return Finding("warning", what, f"{source}, force", hint)
 
 

@@ -18,6 +18,7 @@ from jaxid.consistency.reference_hold import (
     reference_hold_setting,
 )
 from jaxid.consistency.sign import sign_findings
+from jaxid.consistency.timing import timing_findings
 from jaxid.consistency.weight import weight_findings
 from jaxid.logs.soundness import Finding, raise_on_error
 from jaxid.machine import Machine
@@ -79,6 +80,8 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
             log, data = opened.log, opened.data
             declared = balance_fits(machine, data)[0]
 
+    if better is None or free_hold:  # a wrong hold is half a sample late
+        findings += timing_findings(machine, log, data, declared)
     confirmed = False
     if case.log is not None and case.log.reference is not None:
         machine, doubts, setting, confirmed = _with_reference_hold(case, machine, opened, declared)

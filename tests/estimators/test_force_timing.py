@@ -29,24 +29,35 @@ def case_of(setup: Setup, **log: object) -> dict:
     return {name: case[name] for name in ("plant", "effects", "actuator")} | {"log": table}
 
 
-def deviations(estimate, values=VALUES) -> np.ndarray:
+def close(estimate, other) -> bool:
+    """Check that two fits differ by less than a standard deviation, and are within 0.2 % of the truth."""
+    near = np.abs(estimate.theta / [VALUES[name] for name in estimate.names] - 1) < 2e-3
+    return bool(np.all(near & (np.abs(estimate.theta - other.theta) < other.std)))
+
+
+def deviations(estimate, values) -> np.ndarray:
     return (estimate.theta - [values[name] for name in estimate.names]) / estimate.std
 
 
 @pytest.fixture(scope="module")
 def setup() -> Setup:
-    return emps_like(1, 1.0, 4.0)
+    return emps_like(1, 1.0, 3.0)
+
+
+@pytest.fixture(scope="module")
+def in_time(setup):
+    return jaxid.identify(case_of(setup), logged(setup))
 
 
 @pytest.mark.parametrize("late", [1, -1])
-def test_a_force_that_is_a_sample_off_is_taken_back(setup, late):
+def test_a_force_that_is_a_sample_off_is_taken_back(setup, in_time, late):
     case, columns = case_of(setup), logged(setup, late)
-    found = jaxid.identify(case, columns, validate=[logged(emps_like(2, 1.0, 4.0), late)])
+    found = jaxid.identify(case, columns, validate=[logged(emps_like(2, 1.0, 3.0), late)])
 
     delay = found.estimate.details["force_delay"]
     assert delay["used"]
     assert abs(delay["value"] - 1e-3 * late) < 3 * delay["std"]
-    assert np.abs(deviations(found.estimate)).max() < 3.0
+    assert close(found.estimate, in_time.estimate)
     assert found.model_complete
 
     side = "late" if late > 0 else "early"
@@ -54,9 +65,7 @@ def test_a_force_that_is_a_sample_off_is_taken_back(setup, late):
     assert "to confirm it" in found.session.findings[-1].hint
     assert found.session.settings["force_delay"]["value"] == pytest.approx(f"{delay['value']:.3g} s")
     # The gaps are those of the force where it acts, and so are those of logs to validate on.
-    assert (
-        found.gaps[0].force.rms[0] < 0.1 * jaxid.identify(case, columns, method="power").gaps[0].force.rms[0]
-    )
+    assert found.gaps[0].force.rms[0] < 1.5 * found.noise_floor[0]
     assert found.gaps[1].force.rms[0] < 1.5 * found.gaps[0].force.rms[0]
 
 
@@ -67,15 +76,13 @@ def test_as_logged_the_values_are_off(setup):
     assert abs(taken.estimate.value("viscous_friction.coefficient") / 203.5 - 1) > 0.01
 
 
-def test_a_force_in_time_has_no_delay(setup):
-    found = jaxid.identify(case_of(setup), logged(setup))
-    assert "force_delay" not in found.estimate.details
-    assert "force_delay" not in found.session.settings
-    assert found.model_complete
-    assert np.abs(deviations(found.estimate)).max() < 3.0
+def test_a_force_in_time_has_no_delay(in_time):
+    assert "force_delay" not in in_time.estimate.details
+    assert "force_delay" not in in_time.session.settings
+    assert in_time.model_complete
 
 
-def test_a_long_delay_is_said_and_not_taken(setup):
+def test_a_long_delay_is_said_and_not_taken(setup, in_time):
     found = jaxid.identify(case_of(setup), logged(setup, 3))
     delay = found.estimate.details["force_delay"]
     assert not delay["used"]
@@ -85,7 +92,7 @@ def test_a_long_delay_is_said_and_not_taken(setup):
 
     stated = jaxid.identify(case_of(setup, delay={"force": delay["value"]}), logged(setup, 3))
     assert stated.model_complete
-    assert np.abs(deviations(stated.estimate)).max() < 3.0
+    assert close(stated.estimate, in_time.estimate)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +100,7 @@ def test_a_long_delay_is_said_and_not_taken(setup):
 )
 def test_a_missing_effect_is_no_delay(kind):
     row = SEARCH_CASES[kind]
-    hiding = replace(row, duration=4.0).setup(1)
+    hiding = replace(row, duration=3.0).setup(1)
     case = tomllib.loads(row.text())
     case = {name: case[name] for name in ("plant", "effects", "actuator")}
     found = jaxid.identify(case | {"log": case_of(hiding)["log"]}, logged(hiding))
