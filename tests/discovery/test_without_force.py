@@ -10,8 +10,11 @@ import pytest
 
 import jaxid
 from benchmarks.unforced_machines import command_of, servo
+from jaxid.discovery.in_loop import unforced
+from jaxid.discovery.in_loop.afar import FEW
 from jaxid.discovery.in_loop.positions import LoopAcceptance, PositionDomain
 from jaxid.errors import InputError
+from jaxid.session import open_session
 from tests.estimators.test_unforced import CASE, DELAY, FREE, TRUE, log
 from truth.axis.machines import Setup, moves, multisine
 from truth.axis.stepper import Loop, Machine, Sensor
@@ -182,3 +185,20 @@ def test_two_logs_are_searched_together():
     true = first.effects["unbalance"]["moment"] / first.inertia
     assert abs(moment["value"] - true) < 4 * moment["std"]
     assert d.where.text.startswith("log ")
+
+
+def test_an_inertia_near_its_guess_is_not_lost_by_an_effect():
+    """The model without it had run far away: load friction was turned down for that."""
+    drawn = servo(1)
+    session = open_session(drawn.case(), drawn.columns())
+    search = unforced._search(session, session.machine, FEW, lambda text: None)
+    names = session.machine.parameters.names
+    k, guess = names.index("inertia"), session.machine.parameters.guess
+    index = next(c for c in search.superset.candidates if c.kind == "load_friction").index
+
+    near = search.superset.neutral.copy()
+    near[search.superset.base], near[index] = guess, 0.3
+    away, gone = near.copy(), near.copy()
+    away[k], gone[k] = 30.0 * guess[k], 0.01 * guess[k]
+    assert search.acceptance.objection(index, away, near, None, None, 6) == ""
+    assert "next to nothing" in search.acceptance.objection(index, away, gone, None, None, 6)

@@ -346,7 +346,7 @@ class LoopSearch(Search):
 
     def _acceptance(self) -> Acceptance:
         shared = (self.superset, self.data, self.validation, self.floor, self.colour)
-        return LoopAcceptance(*shared, positions=self.positions, logs=self.logs)
+        return LoopAcceptance(*shared, guess=self.guess, positions=self.positions, logs=self.logs)
 
     def fit(self, theta: np.ndarray, active: np.ndarray) -> np.ndarray:
         """Fit the active unknowns to the log, from and beside the others, and from earlier fits of them."""

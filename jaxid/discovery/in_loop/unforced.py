@@ -240,6 +240,7 @@ def _search(
         ),
         coarse=coarse,
         afar=Afar(far, scaled, effort),
+        guess=tuple(declared[name] for name in machine.parameters.names),
     )
     return search
 
