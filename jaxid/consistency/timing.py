@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -116,4 +117,5 @@ class _Shifted:
         tried = _TRIED * self.period
         k = int(np.argmin([cost(delay) for delay in tried]))
         bounds = (tried[max(k - 1, 0)], tried[min(k + 1, tried.size - 1)])
-        return float(scipy.optimize.minimize_scalar(cost, bounds=bounds, method="bounded").x)
+        found: Any = scipy.optimize.minimize_scalar(cost, bounds=bounds, method="bounded")
+        return float(found.x)
