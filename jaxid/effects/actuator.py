@@ -218,6 +218,8 @@ class VoltageLimit(Effect):
     met = "small servos and battery drives at high speed"
     part = "drive"
 
+    without_force_on_request = True
+
     adds_force = False
     in_drive = True
     on_request = True

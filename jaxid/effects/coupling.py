@@ -31,6 +31,7 @@ class Backlash(Effect):
     of_spring = True
     with_springs = True
     opens_spring = True
+    without_force_on_request = True
 
     gap: Array = parameter("position", "positive", "total clearance")
 

@@ -50,7 +50,7 @@ class Timing:
 
     @property
     def is_timing(self) -> bool:
-        """Whether the delay may be that of a logger: at most one sample."""
+        """True if the delay may be that of a logger: at most one sample."""
         return abs(self.samples) - 2 * self.std <= MOST
 
     def noted(self, estimate: Estimate, period: float) -> Estimate:

@@ -191,6 +191,8 @@ class Effect(eqx.Module):
     duplicates_field: ClassVar[str | None] = None
     # Whether a search of a log without a force, in its simulated loop, tries it.
     without_force: ClassVar[bool] = False
+    # Whether such a search tries it only if [discover] requests it, because it takes long or seldom acts.
+    without_force_on_request: ClassVar[bool] = False
     # Whether a robot's file has room for it at a joint, as one strength.
     in_robot_file: ClassVar[bool] = False
     # Whether it is the law of a spring; on a plant with springs it acts on an elongation.

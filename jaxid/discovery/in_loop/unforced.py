@@ -48,8 +48,6 @@ from jaxid.simulation.loops import Trajectory
 from jaxid.simulation.replay import Numerics, Replay, make_replay
 from jaxid.simulation.sensor_noise import position_noise
 
-# Effects of servos that take long to search, or seldom act.
-_ASKED = ("backlash", "voltage_limit")
 UNSEEN = "a log without a force is compared in the simulated loop, which follows no jump at break-away"
 # Samples of the window in which the residual is loudest, as a part of the log.
 _WINDOW = 0.02
@@ -133,8 +131,10 @@ def explored_from(
 
 def _not_asked(session: Session) -> list[str]:
     """Return a note on effects that were not tried because nobody asked for them."""
+    from jaxid.effects import EFFECTS
+
     asked = {*session.case.kinds, *(cls.kind for cls in session.case.candidates)}
-    left = [kind for kind in _ASKED if kind not in asked]
+    left = sorted(k for k, cls in EFFECTS.items() if cls.without_force_on_request and k not in asked)
     if not left:
         return []
     return [f"not tried: {' and '.join(left)}; name them in candidates of [discover] to search for them"]
