@@ -144,7 +144,7 @@ def explore(
         return explore_unforced(session, max_effects=most, progress=progress)
 
     need_force(session, "a search of a log with a force")
-    _need_no_command_effects(session)
+    _need_effects_of_force(session)
     need_known_controller(session, "a search in forces does not simulate the loop")
     if session.fit.log.steady is not None:
         from jaxid.discovery.steady import explore_steady
@@ -333,8 +333,8 @@ def _need_one_servo(session: Session) -> None:
         raise InputError(what, where=session.case.where, hint=hint)
 
 
-def _need_no_command_effects(session: Session) -> None:
-    """Refuse a search for an effect in front of the controller, which a logged force does not show.
+def _need_effects_of_force(session: Session) -> None:
+    """Refuse a search for an effect that is tried in logs without a force only.
 
     Raises:
         InputError: If the case asks for one.
@@ -345,6 +345,14 @@ def _need_no_command_effects(session: Session) -> None:
                 f"{cls.kind} acts in front of the controller, and the log has a force, which comes after it",
                 where=f"{session.case.where}, [discover]",
                 hint="leave it out, or leave force out of [log] to search in the simulated loop",
+            )
+    plant = session.machine.plant
+    for cls in session.case.candidates:
+        if cls.of_joint is not None and not plant.springs(plant.joints):
+            raise InputError(
+                f"{cls.kind} of a joint without a spring is searched for only in a log without a force",
+                where=f"{session.case.where}, [discover]",
+                hint="leave it out, or declare joint_flexibility with a gap to fit it",
             )
 
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.optimize
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Float
 
 from jaxid.consistency.balance_fit import BalanceFit, balance_fits
+from jaxid.consistency.late_model import LateModel, least_near
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 
@@ -30,8 +31,6 @@ _SIMPLER = 0.98
 _TRIED = 0.25 * 2.0 ** (np.arange(15) / 2.0)
 # Time constants after which a low-pass has forgotten a stop: a four-hundredth of a dry friction is left.
 _DECAYED = 6.0
-# Samples that are added at each end, which the transform joins to a circle.
-_PAD = 256
 # Largest number of kept samples: more tell a time constant no better than is needed here.
 _MOST = 8000
 
@@ -118,8 +117,8 @@ def late_force(
         return None
     driven = [int(j) for j in machine.plant.driven(machine.plant.joints)]
     part, part_held = _longest(data), _longest(data if held is None else held)
-    now, found = (_plain(balance_fits(m, part)[0]) for m in (machine, whole))
-    late = _Reading.of(now if held is None else _plain(balance_fits(machine, part_held)[0]), part_held)
+    now, found = (plain(balance_fits(m, part)[0]) for m in (machine, whole))
+    late = _Reading.of(now if held is None else plain(balance_fits(machine, part_held)[0]), part_held)
     if not (now.finite and found.finite and late.fit.finite):
         return None
     late = late.beside_stops(sum(late.best()), found.counts)
@@ -141,7 +140,7 @@ def _longest(data: Prepared) -> Prepared:
     return max(data.parts(_MOST, 1), key=lambda piece: int(piece.fitted.sum()))
 
 
-def _plain(fit: BalanceFit) -> BalanceFit:
+def plain(fit: BalanceFit) -> BalanceFit:
     """Return a balance of the declared forces alone."""
     return replace(fit, potential=fit.potential[..., :0])
 
@@ -151,64 +150,53 @@ class _Reading:
     """A balance whose model is compared with a force that was read late.
 
     Args:
-        fit: The balance.
-        model: Transform of the model's force and of its columns at the kept samples, padded, (f, n, 1 + p).
-        frequency: Frequencies of the transform [Hz], (f,).
-        period: Sampling time of the log [s].
-        kept: Time between kept samples [s].
+        late: The balance, and its model at any delay.
     """
 
-    fit: BalanceFit
-    model: Complex[np.ndarray, "f n columns"]
-    frequency: Float[np.ndarray, " f"]
-    period: float
-    kept: float
+    late: LateModel
+
+    @property
+    def fit(self) -> BalanceFit:
+        """The balance."""
+        return self.late.fit
 
     @classmethod
     def of(cls, fit: BalanceFit, data: Prepared) -> _Reading:
         """Transform the model of a balance."""
-        model = np.concatenate([(fit.known + fit.force)[..., None], fit.columns], axis=2)
-        padded = np.pad(model, [(_PAD, _PAD), (0, 0), (0, 0)], mode="edge")
-        kept = data.period * data.recipe.decimation
-        frequency = np.fft.rfftfreq(len(padded), kept)
-        return cls(fit, np.fft.rfft(padded, axis=0), frequency, data.period, kept)
+        return cls(LateModel.of(fit, data))
 
     def beside_stops(self, time: float, counts: Bool[np.ndarray, "kept n"]) -> _Reading:
         """Return the reading at some samples only, without those to which a stop is carried by a low-pass."""
         counts = self.fit.counts & counts
         left = counts.copy()
-        reach = min(int(np.ceil(_DECAYED * time / self.kept)), len(left) - 1)
+        reach = min(int(np.ceil(_DECAYED * time / self.late.kept)), len(left) - 1)
         for k in range(1, reach + 1):
             left[k:] &= counts[:-k]
         # Before the first sample nothing is known.
         left[:reach] = False
-        return replace(self, fit=replace(self.fit, counts=left))
+        return _Reading(replace(self.late, fit=replace(self.fit, counts=left)))
 
     def residual(self, delay: float, lag: float) -> Float[np.ndarray, "kept n"]:
-        """Return the force residual of the best fit, if the force was read late.
-
-        The low-pass is that of a drive, at the log's rate: w[k] = w[k-1] + a (u[k] - w[k-1]) with
-        a = 1 - exp(-period / lag).
-        """
-        turn = 2j * np.pi * self.frequency
-        keeps = np.exp(-self.period / lag) if lag > 0.0 else 0.0
-        passes = np.exp(-turn * delay) * (1 - keeps) / (1 - keeps * np.exp(-turn * self.period))
-        rows = len(self.fit.known) + 2 * _PAD
-        late = np.fft.irfft(self.model * passes[:, None, None], rows, axis=0)[_PAD:-_PAD]
-        read = replace(self.fit, known=late[..., 0] - self.fit.force, columns=late[..., 1:])
-        return read.fit(bounded=True)[1]
+        """Return the force residual of the best fit, if the force was read late."""
+        return self.late.at(delay, lag).fit(bounded=True)[1]
 
     def best(self) -> tuple[float, float]:
         """Return the delay and the time constant that leave least; one is zero if the other does as well."""
         delay, by_delay = self._search(lambda t: (t, 0.0))
         lag, by_lag = self._search(lambda t: (0.0, t))
-        start, size = np.array([0.5 * delay, lag]), 0.25 * max(delay, lag, self.period)
+        close = 0.01 * self.late.period
+        start, size = np.array([0.5 * delay, lag]), 0.25 * max(delay, lag, self.late.period)
         corners = np.abs(start + size * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, -1.0]]))
         both = scipy.optimize.minimize(
             lambda x: self._cost(*np.abs(x)),
             start,
             method="Nelder-Mead",
-            options={"initial_simplex": corners, "xatol": 0.01 * self.period, "fatol": 0.0, "maxfev": 60},
+            options={
+                "initial_simplex": corners,
+                "xatol": close,
+                "fatol": 0.0,
+                "maxfev": 60,
+            },
         )
         simple = (delay, 0.0) if by_delay <= by_lag / _SIMPLER else (0.0, lag)
         if both.fun < _SIMPLER * min(by_delay, by_lag):
@@ -218,14 +206,8 @@ class _Reading:
 
     def _search(self, times: Callable[[float], tuple[float, float]]) -> tuple[float, float]:
         """Return the best time along one axis, and its cost."""
-        tried = np.concatenate([[0.0], _TRIED * self.period])
-        costs = [self._cost(*times(t)) for t in tried]
-        k = int(np.argmin(costs))
-        bounds = (tried[max(k - 1, 0)], tried[min(k + 1, tried.size - 1)])
-        found = scipy.optimize.minimize_scalar(
-            lambda t: self._cost(*times(t)), bounds=bounds, options={"xatol": 0.01 * self.period}
-        )
-        return (float(found.x), float(found.fun)) if found.fun < costs[k] else (float(tried[k]), costs[k])
+        tried = np.concatenate([[0.0], _TRIED * self.late.period])
+        return least_near(lambda t: self._cost(*times(t)), tried, 0.01 * self.late.period)
 
     def _cost(self, delay: float, lag: float) -> float:
         """Return the gap of all joints, each in parts of its force."""

@@ -156,16 +156,12 @@ def _with_force_at(fit: JointLikelihood, force: _Force, samples: float) -> Joint
     """Return a likelihood under a force that was logged so many samples late."""
     [member] = fit.members
     kalman, log = member.problem.kalman, member.part.log
-    log = replace(log, force=_moved(force.rows, samples, log.hold))
-    kalman = replace(kalman, command=_moved(force.ticks, samples * kalman.every, log.hold))
-    of_moved = replace(member, part=replace(member.part, log=log), at=replace(member.at, log=log))
+    delay = samples * log.period
+    moved = replace(log, force=earlier(log.time, force.rows, delay, log.hold))
+    ticks = log.period / kalman.every * np.arange(len(force.ticks))
+    kalman = replace(kalman, command=earlier(ticks, force.ticks, delay, log.hold))
+    of_moved = replace(member, part=replace(member.part, log=moved), at=replace(member.at, log=moved))
     return replace(fit, members=(replace(of_moved, problem=member.problem._replace(kalman=kalman)),))
-
-
-def _moved(x: Float[np.ndarray, "time m"], late: float, hold: str) -> Float[np.ndarray, "time m"]:
-    """Return signals that were read so many of their samples late at the time at which they acted."""
-    time = np.arange(len(x), dtype=np.float64)
-    return np.stack([earlier(time, column, late, hold) for column in x.T], axis=1)
 
 
 def _newton(fit: JointLikelihood, end: Maximum, force: _Force, at: float) -> Steps[Timing]:

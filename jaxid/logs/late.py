@@ -55,18 +55,18 @@ def _by_column(stated: float | tuple[float, ...], width: int, name: str, where: 
 
 
 def earlier(
-    time: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], delay: float, hold: str | None
-) -> Float[np.ndarray, " samples"]:
+    time: Float[np.ndarray, " samples"], x: Float[np.ndarray, "samples ..."], delay: float, hold: str | None
+) -> Float[np.ndarray, "samples ..."]:
     """Return a signal as it will be read after a delay; readings beyond the ends are those at the ends.
 
     Between samples of a held force lines give the mean of what was held over a sample; of one that is not
     held they would damp what is fast, so that it follows cubic splines.
     """
-    then = np.clip(time + delay, time[0], time[-1])
-    if hold in (None, "zero_order"):
-        return np.interp(then, time, x)
     import scipy.interpolate  # a third of a second, which reading another log does not need
 
+    then = np.clip(time + delay, time[0], time[-1])
+    if hold in (None, "zero_order"):
+        return scipy.interpolate.make_interp_spline(time, x, k=1)(then)
     return scipy.interpolate.CubicSpline(time, x)(then)
 
 

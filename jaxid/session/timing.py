@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
+from jaxid.consistency.timing import shifts_force, states_delay
 from jaxid.logs.finding import Finding
 from jaxid.logs.late import earlier
 from jaxid.machine import Machine
@@ -15,9 +14,7 @@ from jaxid.session.preparing import prepared
 
 def states_timing(session: Session) -> bool:
     """Check whether the case says by how much the force was logged late, or has an effect that shifts it."""
-    table = session.case.log
-    stated = table is not None and any("force" in (times or {}) for times in (table.delay, table.lag))
-    return stated or any(e.delays_command() or not e.adds_force for e in session.machine.plant.effects)
+    return states_delay(session.case.log) or shifts_force(session.machine)
 
 
 def session_with_force_at(session: Session, delay: float, finding: Finding) -> Session:
@@ -42,6 +39,5 @@ def session_with_force_at(session: Session, delay: float, finding: Finding) -> S
 def _moved(opened: OpenedLog, delay: float, machine: Machine) -> OpenedLog:
     """Return a log with its force taken back."""
     log = opened.log
-    columns = [earlier(log.time, x, delay, log.hold) for x in log.force.T]
-    log = replace(log, force=np.stack(columns, axis=1))
+    log = replace(log, force=earlier(log.time, log.force, delay, log.hold))
     return replace(opened, log=log, data=prepared(log, opened.machine(machine), opened.data.recipe))
