@@ -321,7 +321,7 @@ def search_keys(root: Spot, kinds: Kinds) -> dict[str, Key]:
 
     def candidate(value: Any, spot: Spot) -> type[Effect]:
         kind = text(value, spot)
-        if kind in effects and (effects[kind].on_request or effects[kind].of_joint is not None):
+        if kind in effects and (effects[kind].on_request or effects[kind].without_force_on_request):
             return effects[kind]
         if kind in effects:
             raise spot.refuse(kind, "takes part in every search", "leave it out")

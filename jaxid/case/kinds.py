@@ -29,6 +29,7 @@ FILE = Path(__file__).with_name("kinds.json")
 _OF_PLANTS = ("linked", "usual_motion", "passives", "tools", "actuated")
 _OF_EFFECTS = (
     "on_request",
+    "without_force_on_request",
     "with_springs",
     "of_spring",
     "in_drive",

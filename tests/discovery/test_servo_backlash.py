@@ -1,23 +1,24 @@
 """Backlash of a servo without a force, between a motor with its encoder and its load: exact stepper."""
 
 import json
-import tomllib
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import jaxid
 from benchmarks.unforced_machines import servo
+from jaxid.cli import main
 from jaxid.discovery.in_loop.unforced import _not_asked, searched
 from jaxid.effects.coupling import Backlash, BacklashOfJoint, JointFlexibility
-from jaxid.errors import InputError
 from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.model.effect import Signals
 from jaxid.session import open_session
 from jaxid.simulation.noisy_loop import estimated_noise
 from jaxid.simulation.replay import make_replay
 from truth.axis.hidden_effects import SEARCH_CASES
+from truth.axis.stepper import write_csv
 
 VALUES = {"stiffness": 60.0, "damping": 0.2, "load_inertia": 3e-3, "gap": 0.03}
 SPRING = {"kind": "joint_flexibility", **VALUES}
@@ -87,10 +88,14 @@ def test_backlash_is_named_alone_with_its_gap(tmp_path):
     assert set(effect.parameters) == set(VALUES)
 
 
-def test_a_search_with_a_force_refuses_it_in_one_line():
+def test_a_search_with_a_force_refuses_it_in_one_line(tmp_path, monkeypatch, capsys):
+    """By the command, which reads a case without the classes of the effects: it ended in a traceback."""
+    monkeypatch.chdir(tmp_path)
     row = replace(SEARCH_CASES["quadratic_drag"], duration=3.0)
-    case, run = tomllib.loads(row.text()), row.setup(1).run()
-    case = {name: case[name] for name in ("plant", "effects", "actuator")}
-    case |= {"log": {"time": "t", "position": "q", "force": "u"}, "discover": {"candidates": ["backlash"]}}
-    with pytest.raises(InputError, match="backlash of a joint without a spring"):
-        jaxid.discover(case, {"t": run["t"], "q": run["position"], "u": run["force"]})
+    write_csv(row.setup(1).run(), "log.csv")
+    Path("case.toml").write_text(row.text() + '[discover]\ncandidates = ["backlash"]\n')
+    assert main(["discover", "case.toml", "log.csv", "-o", "out"]) == 2
+    message = capsys.readouterr().err
+    assert "backlash of a joint without a spring is searched for only in a log without a force" in message
+    assert "Traceback" not in message
+    assert not Path("out").exists()
