@@ -55,6 +55,10 @@ SEVERAL_LOGS = (
 DISCOVER, IN_LOOP = "discover", "in_loop"
 # Methods that maximise a likelihood, so that it has a Hessian and profiles.
 LIKELIHOOD_METHODS = ("output_error", "prediction_error", "within_prior")
+# Methods that leave out rows in which the force is not known, and those that take no logged force if the
+# control law is declared.
+LEAVE_ROWS_OUT = ("prediction_error", "inverse_dynamics", "instrumental_variable", "didim", "recursive")
+SIMULATE_THE_LOOP = ("output_error", "within_prior")
 # Pictures that `jaxid plot` draws of a result, and the name of its table of signals.
 SIGNALS = "signals"
 PICTURES = (

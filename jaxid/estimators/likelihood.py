@@ -16,6 +16,7 @@ from jaxid.errors import InputError
 from jaxid.estimators.common.levenberg_marquardt import Transform
 from jaxid.estimators.innovations import Innovations
 from jaxid.logs.log import Log
+from jaxid.logs.prepare import smeared
 from jaxid.machine import Machine
 from jaxid.model.balance import Balance
 from jaxid.numerics.affine import depends
@@ -58,9 +59,10 @@ class Likelihood:
         log: The log, whose force is the command that drives the filter.
         numerics: Settings of the integration.
         law: Command of the declared law, if it explains the logged one; None: the logged one drives.
-        unsure: Mask of the first samples, which never count, (time, n); None: all may count. With dry
-            friction the velocity at the start is not known well enough. A logged command that stands in
-            place of that of the law has the noise of its reading.
+        unsure: Mask of the samples that never count, (time, n); None: all may count. Those are the first
+            ones, as with dry friction the velocity at the start is not known well enough, and as a logged
+            command that stands in place of that of the law has the noise of its reading; and those under a
+            force whose recording is clipped.
         slow: Mask of the samples at rest, which do not count; None: all count.
         force: Size of the logged force, (m,).
         noise: Logarithms of the noise at the start, of the force and then of the readings, (m + k,).
@@ -120,7 +122,7 @@ def likelihood_of(
     slow = None
     if rest_velocity is not None and slides(machine, log):
         slow = slow_samples(log, rest_velocity)
-    unsure = _unsure_start(log, _BEGINS if slow is not None else 0, 0 if law is None else law.logged)
+    unsure = _unsure(log, _BEGINS if slow is not None else 0, 0 if law is None else law.logged)
     if unsure is not None:
         slow = unsure if slow is None else slow | unsure
     kalman = make_filter(machine, driven, numerics, slow, None if law is None else law.offset)
@@ -165,12 +167,17 @@ def likelihood_of(
     )
 
 
-def _unsure_start(log: Log, *first: int) -> np.ndarray | None:
-    """Return the mask of the largest number of first samples, (time, n); None for none."""
-    if not any(first):
+def _unsure(log: Log, *first: int) -> np.ndarray | None:
+    """Return the mask of the first samples and of those under a clipped force, (time, n); None for none.
+
+    A clipped force acts from the sample before it at the earliest, and up to the one behind it.
+    """
+    if not any(first) and log.clipped is None:
         return None
     unsure = np.zeros(log.position.shape, bool)
     unsure[: max(first)] = True
+    if log.clipped is not None:
+        unsure |= smeared(np.asarray(np.any(log.clipped, axis=1, keepdims=True)), 1)
     return unsure
 
 

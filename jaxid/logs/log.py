@@ -23,7 +23,7 @@ from jaxid.names import HOLDS, OPTIONAL_COLUMNS, RESAMPLINGS, STEADY_COLUMNS
 from jaxid.settings import LogTable, log_table
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 # Chosen: with fewer samples nothing remains after filtering and trimming.
 MINIMUM_SAMPLES = 50
@@ -80,6 +80,7 @@ class Log:
         integrated: Whether the velocity was measured, and the position is its integral.
         steady: Precision of the rows of a table of steady speeds; None: the rows are samples over time.
         others: Stretches of rows of the same file that gaps separate from this one, first and end.
+        clipped: Mask of the rows in which a force was larger than recorded, (samples, drives); None: none.
     """
 
     time: Column
@@ -100,6 +101,7 @@ class Log:
     integrated: bool = False
     steady: SteadyRows | None = None
     others: tuple[tuple[int, int], ...] = ()
+    clipped: Bool[np.ndarray, "samples drives"] | None = None
 
     def __post_init__(self):
         """Copy the arrays, make them read-only and check that they fit together.

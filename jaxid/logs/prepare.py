@@ -19,6 +19,8 @@ from jaxid.logs.log import Log, integral
 from jaxid.numerics import filters as signals
 from jaxid.settings import Preprocess
 
+# Part of a force in rows to leave out that a kept sample may hold.
+_CARRIED = 0.01
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
@@ -418,6 +420,10 @@ def prepare(log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | Non
     """
     q, qd, qdd = motion(log, recipe.cutoff_hz, recipe.order, recipe.derivatives, recipe.reach)
     moving, fitted = counted(qd, recipe, log.measured)
+    kept = recipe.decimator.kept(len(q))
+    if log.clipped is not None:
+        known = ~spread(log.clipped, recipe)[:, None]
+        moving, fitted = moving & known, fitted & known
     return Prepared(
         q=q,
         qd=qd,
@@ -428,7 +434,7 @@ def prepare(log: Log, gain: np.ndarray, recipe: Recipe, hold_period: float | Non
         recipe=recipe,
         moving=moving,
         fitted=fitted,
-        kept=recipe.decimator.kept(len(q)),
+        kept=kept,
         measured=log.measured,
     )
 
@@ -454,6 +460,11 @@ def counted(
     # An axis that swings faster than the filter's reach has only reversals: they are kept.
     moving = ~smeared(at_rest | (turns & (reach > 0)), reach)[kept] & seen
     return moving, moving
+
+
+def spread(rows: Bool[np.ndarray, "time m"], recipe: Recipe) -> Bool[np.ndarray, " kept"]:
+    """Return the mask of the kept samples that hold more than a hundredth of some rows, (kept,)."""
+    return np.any(np.abs(np.asarray(recipe.decimator(rows.astype(float)))) > _CARRIED, axis=1)
 
 
 def counted_as(

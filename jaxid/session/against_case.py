@@ -9,6 +9,7 @@ import numpy as np
 from jaxid.build import drives_of_case
 from jaxid.case.case import Case
 from jaxid.consistency.balance_fit import BalanceFit, balance_fits
+from jaxid.consistency.clipped import clipped_force
 from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
 from jaxid.consistency.law import law_findings, loop_velocity_findings, replayed_law
 from jaxid.consistency.noise import estimated_force_noise, noise_findings
@@ -23,7 +24,7 @@ from jaxid.consistency.weight import weight_findings
 from jaxid.logs.soundness import Finding, raise_on_error
 from jaxid.machine import Machine
 from jaxid.session.opened import OpenedLog
-from jaxid.session.preparing import under_hold
+from jaxid.session.preparing import under_hold, without_clipped
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class AgainstCase:
         reference_hold: Course of the reference between samples.
         force_noise: Estimated noise of the force, in units of the command, (m,).
         settings: Choices made from the log; see `Session`.
+        clipped: Rows in which the recording of a force is clipped, (samples, drives); None: none.
     """
 
     findings: list[Finding]
@@ -43,6 +45,7 @@ class AgainstCase:
     reference_hold: str
     force_noise: np.ndarray
     settings: dict[str, dict[str, str]]
+    clipped: np.ndarray | None = None
 
 
 def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold: bool) -> AgainstCase:
@@ -70,6 +73,13 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
     findings = sign_findings(machine, log, data, declared, gain)
     raise_on_error(findings)
 
+    clipped = clipped_force(machine, log, data, declared)
+    if clipped is not None:
+        findings.append(clipped[1])
+        opened = without_clipped(opened, clipped[0], machine)
+        log, data = opened.log, opened.data
+        declared = replace(declared, counts=data.fitted)
+
     hold, better, settings = None, better_hold(machine, log, data, declared), {}
     if better is not None:
         findings.append(hold_finding(log, *better, machine.unit("force"), used=free_hold))
@@ -95,7 +105,8 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
     made = replayed.command if replayed is not None and replayed.exact else None
     noise = estimated_force_noise(machine, log, data, declared, made)
     findings += noise_findings(machine, log, data, declared, noise)
-    return AgainstCase(findings, hold, machine.reference_hold, noise, settings)
+    rows = None if clipped is None else clipped[0]
+    return AgainstCase(findings, hold, machine.reference_hold, noise, settings, rows)
 
 
 def _with_reference_hold(

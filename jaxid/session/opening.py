@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxid.build import build_machine
 from jaxid.case.case import Case, CaseLike, load_case
@@ -28,6 +29,7 @@ from jaxid.session.preparing import (
     recipe_of,
     under_hold,
     with_velocity_scale,
+    without_clipped,
 )
 from jaxid.session.reading import at_joints, read_at_joints, with_reference
 from jaxid.session.sources import Source, between_gaps, one_table, pieces_of, sources_of, unlike
@@ -263,6 +265,8 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
     case, machine, fit = session.declared, session.machine, session.fit
     found = hold_against_case(case, fit.machine(machine) if several else machine, fit, session.chooses_hold)
     session = session.with_machine(replace(machine, reference_hold=found.reference_hold))
+    if found.clipped is not None:
+        session = _without_clipped(session, found.clipped)
     if found.hold is not None:
         session = session_under_hold(session, found.hold)
     machine, opened, more = session.machine, [session.fit, *session.validations], list(session.more)
@@ -274,6 +278,8 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
         # A further log to fit counts by its own noise.
         also = hold_against_case(case, run.machine(machine), run, False)
         findings += also.findings
+        if also.clipped is not None:
+            run = without_clipped(run, also.clipped, machine)
         run = _with_force_noise(run, also.force_noise)
         more[k] = replace(run, reference_hold=run.reference_hold or also.reference_hold)
     return replace(
@@ -286,6 +292,22 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
         settings=found.settings,
         more=tuple(more),
     )
+
+
+def _without_clipped(session: Session, rows: Bool[np.ndarray, "samples m"]) -> Session:
+    """Return a session without the clipped rows of its first log, and with none at that level in validations.
+
+    The logs to validate on are of the same sensors.
+    """
+    machine, log = session.machine, session.fit.log
+    levels = np.where(rows, np.abs(log.force), np.inf).min(axis=0)
+
+    def clean(run: OpenedLog) -> OpenedLog:
+        beyond = np.abs(run.log.force) >= levels
+        return without_clipped(run, beyond, machine) if beyond.any() else run
+
+    validations = tuple(clean(run) for run in session.validations)
+    return replace(session, fit=without_clipped(session.fit, rows, machine), validations=validations)
 
 
 def _with_force_noise(opened: OpenedLog, noise: np.ndarray | None) -> OpenedLog:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxid.case.case import Case
 from jaxid.errors import InputError
@@ -39,6 +40,13 @@ def under_hold(hold: str, opened: OpenedLog, machine: Machine) -> OpenedLog:
     log = replace(opened.log, hold=hold)
     held = opened.data.recipe.hold(log, machine.hold_period)
     return replace(opened, log=log, data=replace(opened.data, hold=held))
+
+
+def without_clipped(opened: OpenedLog, rows: Bool[np.ndarray, "samples m"], machine: Machine) -> OpenedLog:
+    """Return a log without the samples under a force whose recording is clipped."""
+    log = replace(opened.log, clipped=rows)
+    again = prepared(log, opened.machine(machine), opened.data.recipe)
+    return replace(opened, log=log, data=replace(opened.data, moving=again.moving, fitted=again.fitted))
 
 
 def enough(machine: Machine) -> int:

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxid.consistency.absent import known_forces
+from jaxid.consistency.clipped import SEEMS
 from jaxid.consistency.late_force import LateForce
 from jaxid.consistency.law import law_of_rows
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.force_timing import delay_words
 from jaxid.gap import Gap
 from jaxid.machine import Machine
+from jaxid.names import LEAVE_ROWS_OUT, SIMULATE_THE_LOOP
 from jaxid.results.report.numbers import percent, plain, scaled_unit
 from jaxid.results.verdict.absurd import Remark, remarks_on, undetermined
 from jaxid.results.verdict.completeness import Residual, position_residuals, residuals_of
@@ -98,6 +100,7 @@ def judge(
     findings = _scale_words(session)
     findings += [] if estimate.converged else [f"The fit did not converge: {estimate.message}."]
     findings += _delay_words(estimate)
+    findings += _clipped_words(session, estimate)
     findings += [] if late is None else late.findings
     findings += [f"The fit contradicts the case: {r.text}." for r in contrary]
     if against:
@@ -135,6 +138,19 @@ def _scale_words(session: Session) -> list[str]:
         f"Nothing drives the machine, so all values are in proportion to {listed}, which the log cannot "
         "check. If it is an assumption, only the ratios of the values hold."
     ]
+
+
+def _clipped_words(session: Session, estimate: Estimate) -> list[str]:
+    """Return a sentence on the rows of the fitted logs in which the recording of the force is clipped."""
+    masks = [run.log.clipped for run in session.fits if run.log.clipped is not None]
+    if not masks or (session.machine.controller is not None and estimate.method in SIMULATE_THE_LOOP):
+        return []
+    rows, samples = sum(int(m.any(axis=1).sum()) for m in masks), sum(run.log.samples for run in session.fits)
+    head = f"{SEEMS[0].upper()}{SEEMS[1:]} in {rows} rows ({100 * rows / samples:.2g} %)"
+    if estimate.method in LEAVE_ROWS_OUT:
+        return [f"{head}, which are left out."]
+    method = estimate.method
+    return [f"{head}. {method} cannot leave them out, and its values may be off: use prediction_error."]
 
 
 def _delay_words(estimate: Estimate) -> list[str]:
