@@ -14,6 +14,7 @@ from jaxid.case.user_faults import named_faults
 from jaxid.commands.robot_case import implied_case
 from jaxid.consistency.absent import acts_by_position
 from jaxid.consistency.late_force import LateForce, late_force
+from jaxid.consistency.slow_force import SlowForce, slow_force
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.naming import Found, named_at_rest
 from jaxid.discovery.by_sensors import add_by_sensors
@@ -191,7 +192,8 @@ def _explore_forces(
     where = where_of(search, steps[0], session)
     final, effects = _simulable(session, search, baseline.machine, steps, most, progress)
     verdict = "found" if effects else _verdict_on_none(where, steps, search, session, baseline.machine)
-    late = _late_force(session, search, baseline.machine)
+    reading = _late_force(session, search, baseline.machine)
+    reading = reading or _slow_force(session, search, baseline.machine)
 
     progress("refitting in simulation" if refit else "simulating")
     before = after = declared.result()
@@ -224,7 +226,7 @@ def _explore_forces(
         noise_floor=search.floor,
         proposals=separating,
         unseen=found.unseen,
-        late=late,
+        force_reading=reading,
     )
 
 
@@ -272,6 +274,26 @@ def _late_force(session: Session, search: Search, machine: Machine) -> LateForce
         late = late_force(without, whole, data, named, held)
         if late is not None:
             return late
+    return None
+
+
+def _slow_force(session: Session, search: Search, machine: Machine) -> SlowForce | None:
+    """Return the slow course of the force that explains the log better than effects that were found.
+
+    All effects are held against it first, then all but one; None if it explains the log better than none.
+    """
+    model = search.model
+    if not model.added or session.more:
+        return None
+    whole, _ = machine_with(machine, search.superset, model.added, model.theta)
+    added = list(model.added)
+    for beside in ([], *([c] for c in added if len(added) > 1)):
+        without, _ = machine_with(machine, search.superset, beside, model.theta)
+        named = [c for c in added if all(c is not b for b in beside)]
+        unknowns = sum(len(c.index) for c in named)
+        slow = slow_force(without, whole, session.fit.data, [c.label for c in named], unknowns)
+        if slow is not None:
+            return slow
     return None
 
 

@@ -55,6 +55,9 @@ class LateForce:
     effects: tuple[str, ...]
     unit: str
 
+    key = "late_force"
+    short = "late force"
+
     @property
     def keys(self) -> str:
         """The keys of [log] that take the force back to when it acted."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxid.consistency.late_force import LateForce
+from jaxid.consistency.slow_force import SlowForce
 from jaxid.discovery.score import Score
 from jaxid.discovery.where import Where
 from jaxid.estimators.estimate import Estimate
@@ -79,7 +80,8 @@ class Discovery(FitResult):
         noise_floor: RMS force residual that the sensors' noise causes in the band, by joint.
         proposals: Experiments that distinguish effects which explain this log equally well.
         unseen: Reason why break-away friction was not searched for; empty if it was.
-        late: The late force that explains the log as well as effects of the search; None if none does.
+        force_reading: A late or drifting reading of the force that explains the log as well as effects of the
+            search; None if none does.
         joints: Searches of the joints of an arm, each alone, by joint; empty: all were searched at once.
     """
 
@@ -95,7 +97,7 @@ class Discovery(FitResult):
     noise_floor: np.ndarray
     proposals: tuple[Proposal, ...] = ()
     unseen: str = ""
-    late: LateForce | None = None
+    force_reading: LateForce | SlowForce | None = None
     joints: Mapping[int, Discovery] = field(default_factory=dict)
 
     @property

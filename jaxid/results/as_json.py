@@ -354,7 +354,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
         **judgement_json(result),
         "where": where_json(result),
         "effects": [effect_json(e, result.after, result.session.case.plant.names) for e in result.effects],
-        **({"late_force": result.late.json()} if result.late is not None else {}),
+        **({reading.key: reading.json()} if (reading := result.force_reading) is not None else {}),
         "experiments": [proposal_json(p, machine) for p in result.proposals],
         "steps": [
             step_json(r, result.session.machine.plant)

@@ -46,8 +46,8 @@ class FitResult:
         """The verdict on the model, with its reasons."""
         from jaxid.results.verdict import judge
 
-        search, late = getattr(self, "verdict", None), getattr(self, "late", None)
-        return judge(self.session, self.estimate, self.gaps, search, late)
+        search, reading = getattr(self, "verdict", None), getattr(self, "force_reading", None)
+        return judge(self.session, self.estimate, self.gaps, search, reading)
 
     @property
     def model_complete(self) -> bool | None:

@@ -108,8 +108,8 @@ def test_a_search_says_that_a_force_was_logged_late_and_how_to_take_it_back():
     log = logged(servo(), late_by_two)
     found = searched(log)
     assert found.verdict == "found"
-    assert found.late is not None
-    assert found.late.delay == pytest.approx(2 * PERIOD, rel=0.02)
+    assert found.force_reading is not None
+    assert found.force_reading.delay == pytest.approx(2 * PERIOD, rel=0.02)
     assert found.findings[0].startswith("The force seems to be logged 2 ms late")
     assert found.model_complete is not True
 
@@ -124,8 +124,8 @@ def test_a_search_says_that_a_force_passed_a_low_pass():
     log = logged(servo(), lambda u: low_passed(u, 0.004))
     found = searched(log)
     assert found.verdict == "found"
-    assert found.late is not None
-    assert found.late.lag == pytest.approx(0.004, rel=0.02)
+    assert found.force_reading is not None
+    assert found.force_reading.lag == pytest.approx(0.004, rel=0.02)
     assert found.model_complete is not True
 
     back = searched(log, lag={"force": 0.004})

@@ -11,6 +11,7 @@ from jaxid.consistency.absent import known_forces
 from jaxid.consistency.clipped import SEEMS
 from jaxid.consistency.late_force import LateForce
 from jaxid.consistency.law import law_of_rows
+from jaxid.consistency.slow_force import SlowForce
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.force_timing import delay_words
 from jaxid.gap import Gap
@@ -65,7 +66,7 @@ def judge(
     estimate: Estimate,
     gaps: Sequence[Gap],
     search: str | None = None,
-    late: LateForce | None = None,
+    reading: LateForce | SlowForce | None = None,
 ) -> Judgement:
     """Judge a fit.
 
@@ -74,7 +75,8 @@ def judge(
         estimate: Parameters and their precision.
         gaps: Gaps of the fitted machine, the fitted log first.
         search: Verdict of a search for missing effects; None without one.
-        late: The late force that explains the log as well as effects of the search; None if none does.
+        reading: A late or drifting reading of the force that explains the log as well as effects of the
+            search; None if none does.
     """
     residuals = tuple(
         found
@@ -86,7 +88,7 @@ def judge(
         complete = None
 
     remarks = remarks_on(session, estimate)
-    doubt = _doubt(remarks, late)
+    doubt = _doubt(remarks, reading)
     complete = None if complete and doubt else complete
     blind = undetermined(estimate)
     identified = len(blind) < len(estimate.names) or not estimate.names
@@ -101,7 +103,7 @@ def judge(
     findings += [] if estimate.converged else [f"The fit did not converge: {estimate.message}."]
     findings += _delay_words(estimate)
     findings += _clipped_words(session, estimate)
-    findings += [] if late is None else late.findings
+    findings += [] if reading is None else reading.findings
     findings += [f"The fit contradicts the case: {r.text}." for r in contrary]
     if against:
         findings.append(f"This model does not explain the log: {against[0]}")
@@ -259,10 +261,10 @@ def _drifted(session: Session, gaps: Sequence[Gap]) -> list[str]:
     return []
 
 
-def _doubt(remarks: Sequence[Remark], late: LateForce | None) -> str:
+def _doubt(remarks: Sequence[Remark], reading: LateForce | SlowForce | None) -> str:
     """Return the reason for which a model that leaves only noise is not called complete; empty if none."""
-    if late is not None:
-        return f"{' and '.join(late.effects)} may stand for the late force"
+    if reading is not None:
+        return f"{' and '.join(reading.effects)} may stand for the {reading.short}"
     return next((r.text for r in remarks if r.forbids), "")
 
 
