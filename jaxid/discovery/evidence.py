@@ -23,8 +23,6 @@ _STRETCHES = 20
 _RIDGE = 1e-9
 # Sum of squares below which a column is zero.
 _NOTHING = 1e-200
-# Largest correlation of a sample with its past.
-_MOST_ALIKE = 1 - 1e-9
 # Probability that noise alone exceeds the threshold with any of the candidates.
 FALSE_POSITIVE = 1e-3
 
@@ -121,8 +119,6 @@ def _predictor(model: NoiseModel, counts: Bool[np.ndarray, " kept"]) -> scipy.sp
     for k in range(order + 1):
         if k > 0:
             reflection = (covariance[k] - a @ covariance[k - 1 : 0 : -1]) / variance
-            # A residual that wanders is predicted up to rounding; its innovations must not vanish.
-            reflection = np.clip(reflection, -_MOST_ALIKE, _MOST_ALIKE)
             a = np.append(a - reflection * a[::-1], reflection)
             variance = variance * (1 - reflection**2)
         here = np.flatnonzero(past == k)

@@ -75,3 +75,12 @@ def test_a_search_says_first_that_the_force_drifts(drift):
     assert isinstance(found.force_reading, SlowForce)
     assert found.findings[0].startswith("The force seems to drift")
     assert not found.model_complete
+
+
+@pytest.mark.slow
+def test_a_force_that_wanders_is_called_unexplained():
+    """Models that diverge on a playback of an experiment give no evidence, and no warning."""
+    case, log = drawn()
+    walk = 0.02 * np.cumsum(np.random.default_rng(0).standard_normal(len(log["t"])))
+    found = jaxid.discover(case, log | {"u": log["u"] + walk})
+    assert found.model_complete is False

@@ -115,7 +115,7 @@ def _simulated(
 def compared(
     superset: cand.CandidateModel, pair: Pair, samples: cand.CandidateSamples, *, refit: bool = True
 ) -> Outcome:
-    """Compute the evidence in a log for the first of a pair over the second.
+    """Compute the evidence in a log for the first of a pair over the second, none if a model diverges.
 
     Args:
         superset: Machine with all candidates.
@@ -137,6 +137,8 @@ def compared(
     for theta, active in zip((*pair.thetas, without_either), (*pair.active, base), strict=True):
         at = cand.refine(superset, samples, theta, active)[0] if refit else theta
         e, jacobian = cand.evaluate(superset, samples, at, active)
+        if not (np.all(np.isfinite(e[counts])) and np.all(np.isfinite(jacobian[counts]))):
+            return Outcome(0.0, TIE_NATS)
         models.append((e, jacobian[..., active]))
     whitener = ev.Whitener.of(models[0][0], counts)
     screen = Screen.of(whitener, *models[0])
