@@ -25,7 +25,7 @@ from benchmarks.measured import measured_folder
 from benchmarks.so101 import ROW, ROWS, TICKS
 from benchmarks.so101_arm import FITTED, JOINTS, LEFT_OUT
 from benchmarks.stored_runs import commit_of
-from jaxid.discovery.in_loop.by_joint import ArmSearch
+from jaxid.discovery.in_loop.arm_search import ArmSearch
 from jaxid.discovery.result import Discovery
 from jaxid.gap import Gap, gaps
 from jaxid.machine import Machine

@@ -11,7 +11,8 @@ import pytest
 import jaxid
 from benchmarks.unforced import of as machine_of
 from jaxid.discovery.in_loop import unforced
-from jaxid.discovery.in_loop.by_joint import ArmSearch, explore_by_joint, joint_words
+from jaxid.discovery.in_loop.arm_search import ArmSearch
+from jaxid.discovery.in_loop.by_joint import explore_by_joint, joint_words
 from jaxid.discovery.in_loop.whole_arm import without_unneeded
 from jaxid.discovery.result import Discovery
 from jaxid.effects import EFFECTS

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.unforced import of
 from benchmarks.unforced_machines import NOISE
-from jaxid.discovery.in_loop.by_joint import ArmSearch
+from jaxid.discovery.in_loop.arm_search import ArmSearch
 from jaxid.estimators.apart.joint import JointAlone, joints_alone
 from jaxid.estimators.apart.loads import with_simulated_loads
 from jaxid.estimators.apart.start import is_stable, starts_beside
