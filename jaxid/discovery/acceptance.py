@@ -175,13 +175,17 @@ class Acceptance:
         return total, worst
 
     def divergence(self, one: np.ndarray, two: np.ndarray) -> float:
-        """Return the expected gain in log-likelihood of the true one of two models over the other [nats]."""
-        total = 0.0
+        """Return the expected gain in log-likelihood of the true one of two models over the other [nats].
+
+        The noise is what the worse one leaves: evidence is gained over a model that leaves more still.
+        """
+        totals = np.zeros(2)
         for samples in (self.samples, *self.others):
-            e, other = (self.domain.evaluate(samples, theta, ())[0] for theta in (one, two))
-            whitener = ev.Whitener.of(e, samples.moving, self.colour)
-            total += 0.5 * float(np.sum(whitener((e - other)[..., None]) ** 2))
-        return total
+            residuals = [self.domain.evaluate(samples, theta, ())[0] for theta in (one, two)]
+            apart = (residuals[0] - residuals[1])[..., None]
+            whiteners = [ev.Whitener.of(e, samples.moving, self.colour) for e in residuals]
+            totals += [0.5 * float(np.sum(whitener(apart) ** 2)) for whitener in whiteners]
+        return float(totals.min())
 
     def objection(
         self,

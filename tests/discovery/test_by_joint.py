@@ -10,7 +10,7 @@ import pytest
 
 import jaxid
 from benchmarks.unforced import of as machine_of
-from jaxid.discovery.in_loop import unforced
+from jaxid.discovery.in_loop import unforced, whole_arm
 from jaxid.discovery.in_loop.arm_search import ArmSearch
 from jaxid.discovery.in_loop.by_joint import explore_by_joint, joint_words
 from jaxid.discovery.in_loop.whole_arm import without_unneeded
@@ -281,3 +281,50 @@ def test_what_one_joint_alone_lacks_is_no_effect_of_the_whole_arm():
     assert any(note.startswith("load_friction[2] was not added") for note in d.after.notes)
     truth = np.array([drawn.truth()[name] for name in d.after.names])
     assert np.all(np.abs(d.after.theta - truth) < 3 * d.after.std)
+
+
+@pytest.mark.parametrize("needed", [{"saturation"}, {"saturation", "dead_band"}, {"stribeck_friction"}])
+def test_effects_that_the_whole_arm_does_not_need_beside_others_are_left_out(needed, monkeypatch):
+    """Joints with fewer effects are fitted as a whole; here the fit leaves noise if it has what is needed."""
+
+    def effect(kind, evidence):
+        return SimpleNamespace(kind=kind, score=SimpleNamespace(evidence=evidence))
+
+    def search(*effects):
+        return SimpleNamespace(effects=effects)
+
+    class Arm:
+        session = None
+
+        def without(self, found, joint, k):
+            effects = found[joint].effects
+            return {**found, joint: search(*effects[:k], *effects[k + 1 :])}
+
+        def start_of_whole(self, found):
+            return frozenset(e.kind for d in found.values() for e in d.effects), None
+
+    monkeypatch.setattr(
+        whole_arm, "_by_whole", lambda session, kinds, start: (kinds, set() if needed <= kinds else {0})
+    )
+    found = {
+        0: search(effect("saturation", 900.0), effect("stribeck_friction", 39.0)),
+        1: search(effect("dead_band", 60.0)),
+    }
+    kept, fit, notes = whole_arm.with_fewest(Arm(), found, lambda text: None)
+    assert {e.kind for d in kept.values() for e in d.effects} == set(fit) == needed
+    assert len(notes) == 3 - len(needed)
+    assert all("the model with the other effects leaves no more than noise" in note for note in notes)
+
+
+@pytest.mark.slow
+def test_an_effect_beside_another_is_held_against_the_whole_arm():
+    """Alone, the first joint of this arm asks for a Stribeck term beside the friction of its gear."""
+    drawn = machine_of("arm_hidden", 15)
+    d = jaxid.discover(drawn.case(), drawn.columns())
+    assert [e.label for e in d.effects] == ["load_friction[1]"]
+    assert d.model_complete
+    assert any(note.startswith("stribeck_friction[1] was not added") for note in d.after.notes)
+    truth = drawn.truth() | {
+        "load_friction[1].coefficient": drawn.servos[0].effects["load_friction"]["coefficient"]
+    }
+    assert np.all(np.abs(d.after.theta - [truth[name] for name in d.after.names]) < 4 * d.after.std)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxid.discovery.candidates import Candidate
 from jaxid.discovery.in_loop.afar import FEW
@@ -187,12 +188,7 @@ class ArmSearch:
 
     def _with_loads(self, joints: Sequence[JointAlone], found: Mapping[int, Discovery]) -> list[JointAlone]:
         """Return joints with the loads of the simulated arm, with what was found at some of its joints."""
-        machine, names = _with_effects(self.session.machine, found)
-        known = {**self.declared, **{joint: d.after for joint, d in found.items()}}
-        theta = machine.parameters.guess
-        for alone in (_fuller(one, machine, found, names) for one in self.every):
-            if alone.joint in known:
-                theta[alone.index] = alone.of_arm(known[alone.joint].theta)
+        machine, theta = self.start_of_whole(found)
         return with_simulated_loads(joints, theta, [part_of(run, machine) for run in self.session.runs])
 
     def searched(self, joint: int, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
@@ -209,23 +205,71 @@ class ArmSearch:
             own, before, max_effects=max_effects, progress=progress, effort=FEW, judged=False
         )
 
+    def without(self, found: Mapping[int, Discovery], joint: int, effect: int) -> dict[int, Discovery]:
+        """Return the searches without one effect, with the other values of its joint refitted.
+
+        Args:
+            found: Search of each joint that was searched.
+            joint: The joint, from 0.
+            effect: Number of its effect, from 0.
+        """
+        d = found[joint]
+        plant, parameters = d.session.machine.plant, d.session.machine.parameters
+        known = dict(zip(d.after.names, d.after.theta.tolist(), strict=True))
+        values = [known[name] for name in parameters.names]
+        kept, added = [], []
+        for k, (named, there) in enumerate(zip(d.effects, _added(d), strict=True)):
+            if k == effect:
+                continue
+            plant, free = free_effect(plant, there, d.session.machine.units)
+            parameters = parameters.extended(free)
+            values += [known[name] for name in named.names]
+            kept.append(replace(named, names=tuple(f.name for f in free)))
+            added.append(named.score.candidate)
+        machine = d.session.machine.with_plant(plant, parameters).with_estimate(np.array(values))
+        rounds = [r for k, r in enumerate(d.rounds) if k == 0 or _adds_one_of(r, added)]
+        less = replace(d, effects=tuple(kept), rounds=tuple(rounds), after=replace(d.after, machine=machine))
+
+        out = {**found, joint: less}
+        final, names = _with_effects(self.session.machine, out)
+        alone = _fuller(self._alone(joint), final, out, names).with_estimate(np.array(values))
+        (fit,) = _refitted(self.session, [alone])
+        out[joint] = replace(less, after=fit)
+        return out
+
+    def start_of_whole(self, found: Mapping[int, Discovery]) -> tuple[Machine, Float[np.ndarray, " p"]]:
+        """Return the arm with what was found at its joints, and the values of their fits, (p,)."""
+        machine, names = _with_effects(self.session.machine, found)
+        known = {**self.declared, **{joint: d.after for joint, d in found.items()}}
+        theta = machine.parameters.guess
+        for alone in (_fuller(one, machine, found, names) for one in self.every):
+            if alone.joint in known:
+                theta[alone.index] = alone.of_arm(known[alone.joint].theta)
+        return machine, theta
+
     def together(
-        self, found: Mapping[int, Discovery], whole: Estimate | None = None, notes: tuple[str, ...] = ()
+        self,
+        found: Mapping[int, Discovery],
+        *,
+        before: Estimate | None = None,
+        after: Estimate | None = None,
+        notes: tuple[str, ...] = (),
     ) -> Discovery:
         """Return what was found at the joints as the discovery of the arm, simulated as a whole.
 
         Args:
             found: Search of each joint that was searched, as it came.
-            whole: Fit of the declared model to the whole arm, where nothing was found; None: there is none.
+            before, after: Fits to the whole arm of the declared model and of that with what was found; None:
+                those of the joints alone.
             notes: Remarks for a user.
         """
         session, machine = self.session, self.session.machine
         final, names = _with_effects(machine, found)
         known = {joint: found[joint].before if joint in found else e for joint, e in self.declared.items()}
-        before = whole or of_arm(machine, self.parts, self.every, known)
+        before = before or of_arm(machine, self.parts, self.every, known)
         known |= {joint: d.after for joint, d in found.items()}
         fuller = [_fuller(alone, final, found, names) for alone in self.every]
-        after = whole or of_arm(final, self.parts, fuller, known)
+        after = after or of_arm(final, self.parts, fuller, known)
         after = replace(after, notes=(*after.notes, *notes))
         joints = {joint: _at_joint(session, joint, d, names[joint]) for joint, d in found.items()}
         effects = tuple(effect for d in joints.values() for effect in d.effects)
@@ -324,6 +368,11 @@ def _with_effects(
             parameters = parameters.extended(free)
             names[joint].append(tuple(f.name for f in free))
     return machine.with_plant(plant, parameters), names
+
+
+def _adds_one_of(r: Round, added: Sequence[Candidate]) -> bool:
+    """Check that a step of a search added one of some candidates."""
+    return r.step.added is not None and any(r.step.added.candidate is c for c in added)
 
 
 def _added(d: Discovery) -> Sequence[Effect]:

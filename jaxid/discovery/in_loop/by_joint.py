@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 
 from jaxid.discovery.in_loop.arm_search import ArmSearch
-from jaxid.discovery.in_loop.whole_arm import declared_by_whole, without_unneeded
+from jaxid.discovery.in_loop.whole_arm import declared_by_whole, with_fewest, without_unneeded
 from jaxid.discovery.result import Discovery
 from jaxid.session import Session
 
@@ -53,11 +53,12 @@ def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[
     checked = declared_by_whole(session, together.before, progress)
     if checked is None:
         return together
-    whole, needed = checked
-    kept, notes = without_unneeded(found, needed)
-    if not needed:
-        return arm.together(kept, whole, notes)
-    return arm.together(kept, notes=notes) if notes else together
+    whole, open_at = checked
+    kept, notes = without_unneeded(found, open_at)
+    if not any(d.effects for d in kept.values()):
+        return arm.together(kept, before=whole, after=whole, notes=notes)
+    kept, after, more = with_fewest(arm, kept, progress)
+    return arm.together(kept, before=whole, after=after, notes=(*notes, *more))
 
 
 def joint_words(session: Session, joint: int) -> str:
