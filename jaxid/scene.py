@@ -27,6 +27,7 @@ from jaxid.schema import stated
 from jaxid.sensors.encoder import Sensor
 from jaxid.simulation.disturbance import disturbance_at
 from jaxid.simulation.loops import Drive, Trajectory, closed_loop, needed_substeps, open_loop
+from jaxid.simulation.reference_course import reference_at
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,7 @@ class Scene:
                 where=where,
                 hint="take the loop's rate, or a whole part of it",
             )
+        reference = _as_logged(case, reference, every)
         return cls(case, machine, drive, reference, position, velocity, every)
 
     def simulated_log(self, machine: Machine, rng: np.random.Generator) -> Steps[SimulatedLog]:
@@ -228,6 +230,21 @@ def sampling_of(case: Case) -> tuple[float, float]:
         hint = f"add {name} = ... to [simulation]"
         raise InputError(f"[simulation] has no {name}", where=case.where, hint=hint)
     return rate, duration
+
+
+def _as_logged(case: Case, reference: np.ndarray, every: int) -> np.ndarray:
+    """Return the reference of a loop faster than its log, whose course between rows the case may state.
+
+    Args:
+        case: The case.
+        reference: Reference at every tick, (ticks, drives).
+        every: Number of ticks per row of the log.
+    """
+    stated = None if case.log is None else case.log.reference_hold
+    if every == 1 or stated not in ("zero_order", "linear"):
+        return reference
+    ticks = np.arange(len(reference), dtype=np.float64)
+    return reference_at(ticks[::every], reference[::every], ticks, stated)
 
 
 def _by_drive(signal: np.ndarray, machine: Machine) -> np.ndarray:

@@ -21,6 +21,7 @@ from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
 from jaxid.files import check_folder, mark_folder, new_folder, write_json, write_whole
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
+from jaxid.model.unknowns import CONTROLLER
 from jaxid.numerics.lanes import run_alone
 from jaxid.scene import Scene
 from jaxid.simulation.sensor_noise import position_noise
@@ -234,11 +235,13 @@ def _bound(plan: Plan, level: Level) -> np.ndarray:
     The bound holds for an unbiased estimate from the readings of all logs of a run with white noise, if the
     start and the command are known exactly. In a loop too the command follows from the readings so far, so
     that the derivative of the position under a given command counts. The bound is NaN if the case states no
-    noise of the readings, if nothing is fitted to logs, or if the logs do not determine all parameters. If
-    true values are drawn, it is the bound at their median.
+    noise of the readings, if nothing is fitted to logs, if these hold no force or gains are unknown, so that
+    the command is not known exactly, or if the logs do not determine all parameters. If true values are
+    drawn, it is the bound at their median.
     """
     none, scene, whole = np.full(len(plan.names), np.nan), level.scene, level.scene.machine
-    if whole.sensor.position_std is None or not plan.fits:
+    unknown_command = plan.without_force or any(f.path[0] == CONTROLLER for f in whole.parameters.free)
+    if whole.sensor.position_std is None or not plan.fits or unknown_command:
         return none
     every, names = [], whole.parameters.names
     for _, _, machine in machines_of(scene.case, whole):

@@ -79,8 +79,9 @@ class Plan:
 
         Raises:
             InputError: If the case cannot be simulated, no parameter is unknown, the case states no noise
-                that a factor could multiply, `in_loop` is asked of a law that does not identify, or links
-                must be physically consistent and an estimator cannot ensure it.
+                that a factor could multiply, `in_loop` is asked of a law that does not identify, links must
+                be physically consistent and an estimator cannot ensure it, or an estimator needs a force and
+                [log] names none.
         """
         setting, where = case.study, case.where
         if not 0 <= seed < 2**31:
@@ -103,6 +104,7 @@ class Plan:
             elif method != DISCOVER:
                 need_consistent(method, case)
                 need_likelihood(method, case)
+            _need_force(method, case)
         runs = int(setting.runs if runs is None else runs)
         if runs < 1:
             raise InputError(f"{runs} runs", where=where, hint="give one or more")
@@ -124,6 +126,11 @@ class Plan:
     def fits(self) -> bool:
         """The flag of a study that fits anything to the logs."""
         return set(self.estimators) != {IN_LOOP}
+
+    @property
+    def without_force(self) -> bool:
+        """The flag of a study of logs that hold no force, as the case says."""
+        return logs_no_force(self.case)
 
     @property
     def settings(self) -> dict[str, list[float]]:
@@ -201,6 +208,21 @@ class Plan:
 def _about(value: np.ndarray, lower: np.ndarray, upper: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return values changed by factors exp(change), within bounds."""
     return np.minimum(np.maximum(value * np.exp(change), lower), upper)
+
+
+def logs_no_force(case: Case) -> bool:
+    """Check that a case names the columns of a log of a loop, and that no force is among them."""
+    return case.controller is not None and case.log is not None and case.log.force is None
+
+
+def _need_force(method: str, case: Case) -> None:
+    """Refuse a method of jaxid that needs a force in a study of logs without one."""
+    if logs_no_force(case) and method not in ("output_error", DISCOVER, IN_LOOP, *USER_METHODS):
+        raise InputError(
+            f"{method} needs a force, and [log] names none",
+            where=f"{case.where}, [study] estimators",
+            hint="take output_error, or name a column of the force in [log]",
+        )
 
 
 def _need_learner(case: Case, scene: Scene) -> None:

@@ -13,6 +13,7 @@ from jaxid.estimators import SIMULATING, steps_of
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.estimators.simulated_output import choose_numerics
+from jaxid.logs.log import Log
 from jaxid.logs.prepare import Recipe
 from jaxid.names import DISCOVER, IN_LOOP
 from jaxid.numerics.lanes import Steps, run_alone, run_batched
@@ -63,18 +64,27 @@ class Runner:
         """Choose as `identify` does on the log of the nominal machine."""
         at = self.plan.levels[level]
         _, _, simulated = machines_of(at.scene.case, at.scene.machine)[0]
-        log = run_alone(at.scene.simulated_log(simulated, self.plan.drawn(0)[2])).log
+        log = self._read(run_alone(at.scene.simulated_log(simulated, self.plan.drawn(0)[2])).log)
         _, _, fitted = machines_of(at.model, at.machine)[0]
         session = session_around(at.model, fitted, log)
         if len(at.model.fits) > 1:
             return Ways(session.recipe, None)
         if not set(SIMULATING) & set(self.plan.estimators):
             return Ways(session.recipe, None)
+        solver = at.model.output_error.solver
+        if self.plan.without_force:
+            return Ways(session.recipe, choose_numerics(session.machine, log, solver=solver))
         first = inverse_dynamics(session.machine, session.fit.data)
         machine = first.machine if first.all_identified else session.machine
-        solver = at.model.output_error.solver
         numerics = choose_numerics(machine, log, solver=solver)
         return Ways(session.recipe, numerics, LoopFits.of(self.plan, at, session, numerics))
+
+    def _read(self, log: Log) -> Log:
+        """Return the columns of a simulated log that the case names."""
+        if self.plan.without_force:
+            log = replace(log, force=None)
+        # A reference with unknowns is not in the log.
+        return log if self.plan.machine.unknown_reference is None else replace(log, reference=None)
 
     def chunk(self, number: int) -> Arrays:
         """Run a chunk and return arrays by estimator and run.
@@ -115,11 +125,7 @@ class Runner:
         simulated_log = logs[0]
 
         def around(recipe: Recipe) -> Session:
-            # A reference with unknowns is not in the log.
-            read = [
-                made.log if machine.unknown_reference is None else replace(made.log, reference=None)
-                for made in logs
-            ]
+            read = [self._read(made.log) for made in logs]
             if not at.model.fits:
                 return session_around(at.model, machine, read[0], recipe)
             seen = machines_of(at.model, machine)
