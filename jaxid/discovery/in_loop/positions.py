@@ -23,7 +23,7 @@ from jaxid.discovery.in_loop.afar import Afar
 from jaxid.discovery.in_loop.model_fit import STEPS, ModelFit, SimulatedLog
 from jaxid.discovery.score import Score
 from jaxid.discovery.screen import SURROGATES, Screen
-from jaxid.discovery.search import Model, Search
+from jaxid.discovery.search import Model, Search, Step
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import in_threads
@@ -429,6 +429,38 @@ class LoopSearch(Search):
 
     def finer(self, model: Model) -> bool:
         """Return False: each start is a simulation here."""
+        return False
+
+    def alternatives(self, steps: list[Step]) -> dict[int, tuple[Score, ...]]:
+        """Find the effects that could replace those that were added, and one that explains two of them.
+
+        A limit by the supply's voltage looks like a saturation beside a drag, which are added one by one.
+        """
+        out = super().alternatives(steps)
+        if not self._joined(out, steps):
+            return out
+        return super().alternatives(steps)
+
+    def _joined(self, rivals: dict[int, tuple[Score, ...]], steps: list[Step]) -> bool:
+        """Take a rival of an effect beside which another one is superfluous; return whether there is one.
+
+        Args:
+            rivals: Equivalent effects by index of the added effect.
+            steps: Steps of the search; those of the exchange are appended.
+        """
+        for k, scores in rivals.items():
+            named = self.model.added[k]
+            for score in scores if len(self.model.added) > 1 else ():
+                self.progress(f"fitting {score.candidate.label} in place of {named.label}")
+                added = tuple(score.candidate if c is named else c for c in self.model.added)
+                model = Model(added, self.fit(score.refitted, self.fitted_by(added)))
+                others = [c for c in added if c is not score.candidate]
+                fewer, dropped = self.drop_superfluous(model, self.limit, others)
+                if dropped:
+                    steps.append(self.step(model, added=score, dropped=named, threshold=self.limit))
+                    steps.extend(dropped)
+                    self.model = fewer
+                    return True
         return False
 
     def renewed(self, model: Model) -> Model:
