@@ -4,7 +4,6 @@ import io
 import os
 import pickle
 import struct
-import tempfile
 import zipfile
 import zlib
 from pathlib import Path
@@ -16,37 +15,25 @@ import pyarrow
 import pytest
 import scipy.io
 import xarray
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
 
 from jaxid.errors import InputError
-from jaxid.logs.in_memory import as_log
-from jaxid.logs.log import Log, read_log
-
-COLUMNS = {"time": "t", "position": "q", "force": "u"}
-# Few in CI; `-m slow` takes many.
-FEW = settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
-MANY = settings(FEW, max_examples=2000, derandomize=False)
-
-NUMBERS = st.one_of(
-    st.floats(-1e6, 1e6),
-    st.floats(allow_nan=True, allow_infinity=True),
-    st.integers(-(2**40), 2**40).map(float),
+from jaxid.logs.log import read_log
+from tests.support.random_logs import (
+    FEW,
+    MANY,
+    MOVED,
+    NUMBERS,
+    damaged,
+    in_file,
+    outcome,
+    same,
+    steady_table,
+    tables,
 )
-MOVED = st.floats(-1e3, 1e3)
-
-
-@st.composite
-def tables(draw, numbers=MOVED):
-    """Time, position and force: sound but for what `numbers` brings."""
-    rows, rate = draw(st.integers(50, 70)), draw(st.sampled_from([10.0, 500.0, 1000.0, 2**0.5]))
-    column = st.lists(numbers, min_size=rows, max_size=rows)
-    values = {"t": np.arange(rows) / rate, "q": np.array(draw(column)), "u": np.array(draw(column))}
-    if draw(st.booleans()):
-        with np.errstate(over="ignore"):
-            values["u"] = values["u"].astype(np.float32)
-    return values
+from tests.support.written_logs import COLUMNS
 
 
 def csv_text(table, delimiter=",", quoted=False, end="\n", bom=False, comment=False, spaces=False):
@@ -109,39 +96,6 @@ IN_MEMORY = {
 }
 
 
-def outcome(source) -> Log | None:
-    """Return the log, or None if it is refused in one line; anything else fails."""
-    try:
-        log = as_log(source, COLUMNS)
-    except InputError as error:
-        line = str(error)
-    else:
-        line = ""
-    assert "\n" not in line
-    assert len(line) < 1000
-    if line:
-        return None
-    assert np.all(np.isfinite(np.column_stack([log.time, log.position, log.force])))
-    return log
-
-
-def in_file(content: bytes, suffix: str) -> Log | None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"log{suffix}"
-        path.write_bytes(content)
-        return outcome(path)
-
-
-def same(log: Log | None, table) -> None:
-    """Check that a log is the table, and refused only if a number of it is no reading."""
-    sound = all(np.all(np.abs(np.nan_to_num(table[n], nan=np.inf)) <= 1e30) for n in ("q", "u"))
-    assert (log is not None) == sound
-    if log is not None:
-        np.testing.assert_array_equal(log.position[:, 0], table["q"].astype(np.float64))
-        np.testing.assert_array_equal(log.force[:, 0], table["u"].astype(np.float64))
-        np.testing.assert_allclose(log.time, table["t"], rtol=1e-12, atol=1e-12)
-
-
 def check_written(table, style):
     same(in_file(csv_text(table, **style), ".csv"), table)
     for suffix in (".npz", ".mat", ".parquet"):
@@ -172,41 +126,21 @@ def test_what_is_written_is_read_many(table, style):
 
 
 @st.composite
-def damaged(draw):
-    """A sound file with bytes of it changed, cut, repeated or put in."""
+def damaged_files(draw):
     suffix = draw(st.sampled_from(list(WRITERS)))
-    table = {"t": np.arange(60) / 500, "q": np.linspace(-0.7, 0.9, 60), "u": np.linspace(2.0, -1.0, 60)}
-    content = bytearray(draw(st.sampled_from([WRITERS, OTHERS | WRITERS]))[suffix](table))
-    for _ in range(draw(st.integers(1, 4))):
-        if not content:
-            break
-        # Headers and directories stand at the ends.
-        last = len(content) - 1
-        k = draw(st.one_of(st.integers(0, last), st.integers(0, min(200, last))))
-        k = last - k if draw(st.booleans()) else k
-        kind = draw(st.sampled_from(["change", "cut", "repeat", "insert", "zero"]))
-        if kind == "change":
-            content[k] = draw(st.integers(0, 255))
-        elif kind == "cut":
-            del content[k : k + draw(st.sampled_from([1, 2, 100, len(content)]))]
-        elif kind == "repeat":
-            content[k:k] = content[k : k + 50]
-        elif kind == "zero":
-            content[k : k + 8] = bytes(8)
-        else:
-            content[k:k] = draw(st.binary(min_size=1, max_size=8))
-    return suffix, bytes(content)
+    sound = draw(st.sampled_from([WRITERS, OTHERS | WRITERS]))[suffix](steady_table())
+    return suffix, draw(damaged(sound))
 
 
 @settings(FEW, max_examples=100)
-@given(damaged())
+@given(damaged_files())
 def test_a_damaged_file_is_read_or_refused(file):
     in_file(file[1], file[0])
 
 
 @pytest.mark.slow
 @settings(MANY, max_examples=20_000)
-@given(damaged())
+@given(damaged_files())
 def test_a_damaged_file_is_read_or_refused_many(file):
     in_file(file[1], file[0])
 
