@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -145,17 +146,23 @@ def test_tdms_with_waveforms_of_unequal_rate(tmp_path):
 MOTORS = ["shoulder_pan.pos", "elbow_flex.pos"]
 
 
-def lerobot(root: Path, version: str) -> Path:
-    feature = {"dtype": "float32", "shape": [2], "names": MOTORS}
+EPISODES = [
+    {"time": T, "state": np.stack([Q + k, 2 * Q], axis=1), "action": np.stack([U, 3 * U], axis=1)}
+    for k in (0, 1)
+]
+
+
+def lerobot(root: Path, version: str, episodes=EPISODES, kind="float32") -> Path:
+    feature = {"dtype": kind, "shape": [2], "names": MOTORS}
     named = {"motors": MOTORS} if version == "v2.1" else MOTORS
     features = {name: {**feature, "names": named} for name in ("observation.state", "action")}
     scalars = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-    features |= {name: {"dtype": "float32", "shape": [1], "names": None} for name in scalars}
+    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name in scalars}
     paths = {"v2.1": "episode_{episode_index:06d}", "v3.0": "file-{file_index:03d}"}
     info = {
         "codebase_version": version,
         "robot_type": "so101_follower",
-        "total_episodes": 2,
+        "total_episodes": len(episodes),
         "fps": 500,
         "data_path": f"data/chunk-{{chunk:03d}}/{paths[version]}.parquet",
         "features": features,
@@ -163,19 +170,18 @@ def lerobot(root: Path, version: str) -> Path:
     (root / "meta").mkdir(parents=True)
     (root / "meta" / "info.json").write_text(json.dumps(info))
     tables = []
-    for episode in range(2):
-        state = np.stack([Q + episode, 2 * Q], axis=1).astype(np.float32)
-        action = np.stack([U, 3 * U], axis=1).astype(np.float32)
+    for k, episode in enumerate(episodes):
+        count = len(episode["time"])
         tables.append(
             pyarrow.table(
                 {
-                    "observation.state": list(state),
-                    "action": list(action),
-                    "timestamp": pyarrow.array(T.astype(np.float32)),
-                    "frame_index": np.arange(SAMPLES),
-                    "episode_index": np.full(SAMPLES, episode),
-                    "index": np.arange(SAMPLES) + SAMPLES * episode,
-                    "task_index": np.zeros(SAMPLES, int),
+                    "observation.state": list(episode["state"].astype(kind)),
+                    "action": list(episode["action"].astype(kind)),
+                    "timestamp": pyarrow.array(episode["time"].astype(kind)),
+                    "frame_index": np.arange(count),
+                    "episode_index": np.full(count, k),
+                    "index": np.arange(count) + sum(len(e["time"]) for e in episodes[:k]),
+                    "task_index": np.zeros(count, int),
                 }
             )
         )
@@ -281,6 +287,55 @@ def test_rosbag2(tmp_path, plugin):
     )
     refuse(bag, {**ROS, "force": "/joint_states.torque"}, match="have no 'torque'; there is: header, name")
     refuse(bag, {**ROS, "time": "t"}, match='say time = "header.stamp"')
+
+
+def states(stamps, recorded, position, topic="/joint_states"):
+    """Yield joint states of one joint with stamps in nanoseconds."""
+    for k, at in enumerate(stamps):
+        message = joint_state(STORE, 0.0, ["elbow"], [position[k]], [1.0])
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(at, 10**9)
+        yield topic, "sensor_msgs/msg/JointState", recorded[k] / 1e9, message
+
+
+@pytest.mark.parametrize("time", ["header.stamp", "log_time"])
+@pytest.mark.parametrize("topics", [1, 2])
+def test_stamps_keep_their_nanoseconds(tmp_path, time, topics):
+    """Seconds since 1970 as a float have steps of 0.2 us, and the other clock is years apart."""
+    start = 1_700_000_000 * 10**9
+    ticks = [100_007 * k for k in range(100)]
+    at = [start + t for t in ticks]
+    stamps = at if topics == 1 else [t - 1_600_000_000 * 10**9 for t in at]
+
+    with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        for n in range(topics):
+            connection = writer.add_connection(f"/arm{n}", "sensor_msgs/msg/JointState", typestore=STORE)
+            for stamp, recorded, (_, kind, _, message) in zip(
+                stamps, at, states(stamps, at, ticks), strict=True
+            ):
+                assert message.header.stamp.sec == stamp // 10**9
+                writer.write(connection, recorded, STORE.serialize_cdr(message, kind))
+    columns = {"time": time, "position": "/arm0.position", "force": f"/arm{topics - 1}.effort"}
+    log = read_log(tmp_path / "bag", columns)
+    np.testing.assert_allclose(log.time, np.array(ticks) / 1e9, rtol=0, atol=1e-12)
+
+
+def test_nan_in_a_message_is_refused_unless_resample_is_stated(tmp_path):
+    stamps = [nanoseconds(EPOCH + t) for t in T]
+    position = np.where(np.arange(SAMPLES) == 7, np.nan, Q)
+    bag = write_bag(tmp_path / "bag", StoragePlugin.MCAP, states(stamps, stamps, position))
+    refuse(bag, ROS, match=r"1 row\(s\) are NaN or infinite, the first is row 7 \(NaN\)")
+    log = read_log(bag, {**ROS, "resample": 500})
+    np.testing.assert_allclose(log.position[:, 0], Q, atol=1e-3)
+
+
+def test_a_record_of_no_clock_is_refused(tmp_path):
+    stamps = [nanoseconds(EPOCH + t) for t in T]
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, states(stamps, stamps, Q))
+    path = next(bag.glob("*.db3"))
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE messages SET timestamp = -5 WHERE id = 3")
+    database.close()
+    refuse(path, ROS, match="'/joint_states' was recorded at -5 ns since 1970, which no clock gives")
 
 
 def test_a_bag_of_ros_1(tmp_path):

@@ -32,7 +32,10 @@ _NAME = re.compile(r"(?P<topic>[^.]+)\.(?P<field>[^\[\]]+)(\[(?P<entry>.+)\])?$"
 _PART = 20_000
 # Offset between two clocks that is reported [s], and their drift.
 _OFFSET, _DRIFT = 1e-3, 1e-5
-_NANO = 1e-9
+# Nanoseconds in a second. Stamps are counted in whole ones: as seconds since 1970 they would have 0.2 us.
+_SECOND = 10**9
+# Stamp of a message without header, and the last one that a recorder gives: the year 2116 [ns].
+_NONE, _LAST = np.iinfo(np.int64).min, 2**62
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class _Column:
 
 @dataclass
 class _Topic:
-    """Messages of one topic, as far as they are wanted."""
+    """Messages of one topic, as far as they are wanted; times are whole nanoseconds."""
 
     columns: dict[str, _Column]
     recorded: list[np.ndarray] = field(default_factory=list)
@@ -99,7 +102,9 @@ def read_ros(path: Path, names: list[str], rows: Rows | None) -> Table:
     time, columns = on_one_time(readings)
     known = {clocks[0]: time, **columns}
     picked, taken = pick_columns(path, known, names, rows)
-    return Table(picked, taken, {}, tuple(said), frozenset(columns))
+    # A time without a message is no reading; NaN in a message is a fault, as in any other format.
+    whole = frozenset(name for name, (_, values) in readings.items() if not np.isnan(values).any())
+    return Table(picked, taken, {}, tuple(said), whole)
 
 
 def _column(name: str, path: Path) -> _Column:
@@ -125,7 +130,12 @@ def _read(reader: Any, topic: str, columns: dict[str, _Column], path: Path) -> _
     connections = [c for c in reader.connections if c.topic == topic]
     for part in _parts(reader.messages(connections=connections)):
         kind = part[0][0].msgtype
-        out.recorded.append(_NANO * np.array([stamp for _, stamp, _ in part], dtype=np.int64))
+        recorded = np.array([stamp for _, stamp, _ in part], dtype=np.int64)
+        if recorded.min() < 0 or recorded.max() > _LAST:
+            k = int(np.argmax((recorded < 0) | (recorded > _LAST)))
+            what = f"a message of '{topic}' was recorded at {recorded[k]} ns since 1970, which no clock gives"
+            raise InputError(what, where=str(path), hint="record it again")
+        out.recorded.append(recorded)
         quick = kind == _JOINTS and all(c.path in JOINT_VECTORS for c in columns.values())
         if not (quick and reader.is2 and _quickly([raw for _, _, raw in part], out, path)):
             for connection, _, raw in part:
@@ -151,7 +161,8 @@ def _add(message: Any, out: _Topic, path: Path) -> None:
     """Add the wanted fields of one message."""
     header = getattr(message, "header", None)
     stamp = getattr(header, "stamp", None)
-    out.stamps.append(np.array([np.nan if stamp is None else stamp.sec + stamp.nanosec * _NANO]))
+    at = _NONE if stamp is None else stamp.sec * _SECOND + stamp.nanosec
+    out.stamps.append(np.array([at], dtype=np.int64))
     for name, column in out.columns.items():
         value: Any = message
         for part in column.path.split("."):
@@ -206,7 +217,7 @@ def _quickly(raws: Sequence[bytes], out: _Topic, path: Path) -> bool:
         size = np.dtype(kind).itemsize * count
         return np.ascontiguousarray(block[:, at : at + size]).view(f"{order}{kind}")
 
-    stamps = numbers("i4", 4, 1)[:, 0] + _NANO * numbers("u4", 8, 1)[:, 0].astype(np.float64)
+    stamps = numbers("i4", 4, 1)[:, 0].astype(np.int64) * _SECOND + numbers("u4", 8, 1)[:, 0]
     for name, column in out.columns.items():
         values = numbers("f8", starts[column.path], sizes[column.path]).astype(np.float64)
         if column.entry:
@@ -256,27 +267,28 @@ def _times(
     begin = min(t[0] for t in recorded.values())
     if not by_header:
         said = [Assumed("time", RECORDED, "the clock of the recorder, with the delay of the transport")]
-        return {name: t - begin for name, t in recorded.items()}, said
+        return {name: (t - begin) / _SECOND for name, t in recorded.items()}, said
 
-    times, said, lines = {}, [], {}
-    for name, of in topics.items():
-        stamps = np.concatenate(of.stamps)
-        if not np.isfinite(stamps).all() or not stamps.any():
+    stamped = {name: np.concatenate(of.stamps) for name, of in topics.items()}
+    stamped = {name: t for name, t in stamped.items() if t.any() and not (t == _NONE).any()}
+    times, said = {}, []
+    for name, t in recorded.items():
+        if name not in stamped:
             reason = (
                 f"messages of {name} have no stamp: the recorder's clock, with the delay of the transport"
             )
             said.append(Assumed("time", RECORDED, reason))
-            times[name] = recorded[name] - begin
+            times[name] = (t - begin) / _SECOND
             continue
-        lines[name] = _line(stamps, recorded[name])
-        times[name] = stamps
-    if len(lines) == 1 and len(times) == 1:
-        name = next(iter(times))
-        return {name: times[name] - times[name][0]}, said
+        since = (stamped[name] - stamped[name][0]) / _SECOND
+        if len(topics) == 1:
+            return {name: since}, said
 
-    for name, (offset, drift) in lines.items():
-        stamps = times[name]
-        times[name] = stamps + offset + drift * (stamps - stamps[0]) - begin
+        # Clocks may be years apart: that part of the offset is taken off in whole nanoseconds.
+        apart = int(t[0]) - int(stamped[name][0])
+        offset, drift = _line(since, (t - stamped[name] - apart) / _SECOND)
+        times[name] = (t[0] - begin) / _SECOND + offset + (1 + drift) * since
+        offset += apart / _SECOND
         if abs(offset) > _OFFSET or abs(drift) > _DRIFT:
             reason = (
                 f"stamps of {name} are {offset:+.4g} s from the recorder's clock and drift by "
@@ -286,15 +298,18 @@ def _times(
     return times, said
 
 
-def _line(stamps: np.ndarray, recorded: np.ndarray) -> tuple[float, float]:
+def _line(since: np.ndarray, delay: np.ndarray) -> tuple[float, float]:
     """Return offset and drift of the recorder's clock from the stamps: a line below the differences.
 
     A message is recorded after its stamp, so the smallest delays show the clocks. The line goes through the
     smallest differences of the first and of the last tenth.
+
+    Args:
+        since: Stamps, from the first one on [s].
+        delay: Time of the record less the stamp, up to a constant [s].
     """
-    delay = recorded - stamps
-    part = max(stamps.size // 10, 1)
-    first, last = int(np.argmin(delay[:part])), stamps.size - part + int(np.argmin(delay[-part:]))
-    span = stamps[last] - stamps[first]
-    drift = float((delay[last] - delay[first]) / span) if span > 0 and stamps.size > 100 else 0.0
-    return float(delay[first] - drift * (stamps[first] - stamps[0])), drift
+    part = max(since.size // 10, 1)
+    first, last = int(np.argmin(delay[:part])), since.size - part + int(np.argmin(delay[-part:]))
+    span = since[last] - since[first]
+    drift = float((delay[last] - delay[first]) / span) if span > 0 and since.size > 100 else 0.0
+    return float(delay[first] - drift * since[first]), drift
