@@ -1,0 +1,303 @@
+"""Readers of containers (HDF5, Excel, TDMS, MCAP, db3, LeRobot): the numbers written, or one line.
+
+Text tables, arrays and tables in memory are those of `test_readers_by_hypothesis.py`.
+"""
+
+import functools
+import io
+import tempfile
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.support.random_logs import (
+    FEW,
+    MANY,
+    NUMBERS,
+    damaged,
+    in_file,
+    outcome,
+    same,
+    steady_table,
+    tables,
+)
+from tests.support.written_logs import COLUMNS
+
+EPOCH_NS = 1_700_000_000 * 10**9
+JOINT = "sensor_msgs/msg/JointState"
+ROS = {
+    "time": "header.stamp",
+    "position": "/joint_states.position[elbow]",
+    "force": "/joint_states.effort[elbow]",
+}
+LEROBOT = {"time": "timestamp", "position": "observation.state[elbow_flex.pos]", "force": "action[1]"}
+
+
+# Writers: a table and a layout of the format -> bytes. A library that is missing skips the test.
+
+
+def hdf5(table, layout: str) -> bytes:
+    h5py = pytest.importorskip("h5py")
+    buffer = io.BytesIO()
+    options = {
+        "chunked": {"chunks": (16,), "maxshape": (None,)},
+        "compressed": {"chunks": (16,), "compression": "gzip", "shuffle": True, "fletcher32": True},
+        "lzf": {"compression": "lzf"},
+    }
+    latest = {"libver": "latest"} if layout == "latest" else {}
+    with h5py.File(buffer, "w", userblock_size=512 if layout == "matlab" else 0, **latest) as file:
+        if layout == "rows":
+            kind = [(name, values.dtype) for name, values in table.items()]
+            file["run/table"] = np.array(list(zip(*table.values(), strict=True)), dtype=kind)
+        for name, values in table.items() if layout != "rows" else ():
+            values = np.atleast_2d(values) if layout == "matlab" else values
+            values = values.astype(values.dtype.newbyteorder(">")) if layout == "big" else values
+            place = f"run/axis/{name}" if layout == "grouped" else name
+            file.create_dataset(place, data=values, **options.get(layout, {})).attrs["kind"] = "measured"
+    content = buffer.getvalue()
+    text = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, HDF5 schema 1.00 .".ljust(124) + b"\x00\x02IM"
+    return text + content[128:] if layout == "matlab" else content
+
+
+def xlsx(table, layout: str) -> bytes:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook(write_only=layout == "streamed")
+    sheet = book.create_sheet("log") if layout == "streamed" else book.active
+    if layout == "second":
+        sheet.append(["nothing here"])
+        sheet = book.create_sheet("log")
+    for row in [["Antrieb", "X1"], []] if layout == "metadata" else []:
+        sheet.append(row)
+    sheet.append(list(table))
+    for row in zip(*table.values(), strict=True):
+        sheet.append([float(x) for x in row])
+    buffer = io.BytesIO()
+    book.save(buffer)
+    return buffer.getvalue()
+
+
+def tdms(table, layout: str) -> bytes:
+    nptdms = pytest.importorskip("nptdms")
+    buffer = io.BytesIO()
+    half = len(table["t"]) // 2
+    parts = [slice(None, half), slice(half, None)] if layout == "segments" else [slice(None)]
+    with nptdms.TdmsWriter(buffer, version=4713 if layout == "version 2" else 4712) as writer:
+        for part in parts:
+            channels = []
+            for name, values in table.items():
+                properties = {"unit_string": "", "wf_start_offset": 0.0, "wf_increment": float(table["t"][1])}
+                values = values.astype(values.dtype)[part]
+                channels.append(nptdms.ChannelObject("axis", name, values, properties=properties))
+            writer.write_segment(channels)
+    return buffer.getvalue()
+
+
+def stamps(table) -> list[int]:
+    return [EPOCH_NS + round(float(t) * 1e9) for t in table["t"]]
+
+
+def bag(table, layout: str) -> bytes:
+    """Return the one file of a rosbag2, as the writer of rosbags makes it."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    written = pytest.importorskip("tests.logs.test_formats")
+    container, joints = layout.split()
+    plugin = rosbag2.StoragePlugin.SQLITE3 if container == "db3" else rosbag2.StoragePlugin.MCAP
+    names = {"one": ["elbow"], "two": ["shoulder", "elbow"], "odd": ["a", "elbow", "längeres"]}[joints]
+    at = names.index("elbow")
+    with tempfile.TemporaryDirectory() as folder:
+        writer = rosbag2.Writer(Path(folder) / "bag", version=8, storage_plugin=plugin)
+        if container == "zstd":
+            writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
+        with writer:
+            connection = writer.add_connection("/joint_states", JOINT, typestore=written.STORE)
+            for stamp, q, u in zip(stamps(table), table["q"], table["u"], strict=True):
+                values = [[0.0] * at + [float(x)] + [1.0] * (len(names) - at - 1) for x in (q, u)]
+                message = written.joint_state(written.STORE, 0.0, names, *values)
+                message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+                writer.write(connection, stamp, written.STORE.serialize_cdr(message, JOINT))
+        [file] = [p for p in (Path(folder) / "bag").iterdir() if p.suffix in (".db3", ".mcap")]
+        return file.read_bytes()
+
+
+def foxglove(table, layout: str) -> bytes:
+    """Return an MCAP of Foxglove's writer, with the message's definition as text."""
+    mcap = pytest.importorskip("mcap.writer")
+    mcap_ros2 = pytest.importorskip("mcap_ros2.writer")
+    written = pytest.importorskip("tests.logs.test_formats")
+    definition = written.STORE.generate_msgdef(JOINT, ros_version=2)[0]
+    kind = {"lz4": mcap.CompressionType.LZ4, "zstd": mcap.CompressionType.ZSTD}
+    buffer = io.BytesIO()
+    writer = mcap_ros2.Writer(
+        buffer, chunk_size=2000, compression=kind.get(layout, mcap.CompressionType.NONE)
+    )
+    schema = writer.register_msgdef(JOINT, definition)
+    for stamp, q, u in zip(stamps(table), table["q"], table["u"], strict=True):
+        message = {
+            "header": {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": ""},
+            "name": ["elbow"],
+            "position": [float(q)],
+            "velocity": [],
+            "effort": [float(u)],
+        }
+        writer.write_message("/joint_states", schema, message, stamp)
+    writer.finish()
+    return buffer.getvalue()
+
+
+def lerobot(table, layout: str) -> dict[str, bytes]:
+    """Return the files of a dataset of one episode."""
+    pytest.importorskip("pyarrow")
+    written = pytest.importorskip("tests.logs.test_formats")
+    both = {
+        name: np.stack([values, values], axis=1).astype(np.float64)
+        for name, values in (("state", table["q"]), ("action", table["u"]))
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        root = written.lerobot(Path(folder) / "set", layout, [{"time": table["t"], **both}], "float64")
+        return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+class Container(NamedTuple):
+    """A format: its writer and layouts, the columns of its log, and what its writer keeps of numbers."""
+
+    suffix: str
+    write: Callable[[Any, str], Any]
+    layouts: tuple[str, ...]
+    columns: tuple[Mapping, ...] = (COLUMNS,)
+    resolution: float = 1e-12
+    digits: int = 17
+
+
+# Stamps of ROS are whole nanoseconds: two of them, rounded, make a time. Excel's writer keeps 16 digits.
+CLOCKS = (ROS, {**ROS, "time": "log_time"})
+GROUPED = {"time": "axis/t", "position": "q", "force": "axis/u"}
+CONTAINERS = {
+    "hdf5": Container(
+        ".h5", hdf5, ("plain", "grouped", "chunked", "compressed", "lzf", "latest", "rows", "big")
+    ),
+    "matlab": Container(".mat", hdf5, ("matlab",)),
+    "excel": Container(".xlsx", xlsx, ("plain", "second", "metadata", "streamed"), digits=15),
+    "tdms": Container(
+        ".tdms", tdms, ("plain", "segments", "version 2"), (COLUMNS, GROUPED, {**COLUMNS, "time": "wf_time"})
+    ),
+    "mcap": Container(".mcap", bag, ("mcap one", "mcap two", "mcap odd", "zstd two"), CLOCKS, 1.1e-9),
+    "foxglove": Container(".mcap", foxglove, ("lz4", "zstd", "plain"), CLOCKS, 1.1e-9),
+    "db3": Container(".db3", bag, ("db3 one", "db3 two", "db3 odd"), CLOCKS, 1.1e-9),
+    "lerobot": Container("", lerobot, ("v2.1", "v3.0"), (LEROBOT,)),
+}
+
+
+def in_container(content: bytes | Mapping[str, bytes], container: Container, columns: Mapping):
+    """Return the outcome of a file, or of a folder of files."""
+    if isinstance(content, bytes):
+        return in_file(content, container.suffix, columns)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, part in content.items():
+            (Path(folder) / name).parent.mkdir(parents=True, exist_ok=True)
+            (Path(folder) / name).write_bytes(part)
+        return outcome(folder, columns)
+
+
+def check_written(data, name: str, numbers=None) -> None:
+    container = CONTAINERS[name]
+    table = data.draw(tables() if numbers is None else tables(numbers))
+    if container.digits < 17:
+        table |= {n: np.array([float(f"{x:.{container.digits}g}") for x in v]) for n, v in table.items()}
+    content = container.write(table, data.draw(st.sampled_from(container.layouts)))
+    log = in_container(content, container, data.draw(st.sampled_from(container.columns)))
+    same(log, table, container.resolution)
+
+
+def packed(parts: Mapping[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()
+
+
+@functools.cache
+def sound(name: str, layout: str) -> bytes | Mapping[str, bytes]:
+    return CONTAINERS[name].write(steady_table(), layout)
+
+
+def check_damaged(data, name: str) -> None:
+    container = CONTAINERS[name]
+    content = sound(name, data.draw(st.sampled_from(container.layouts)))
+    if name == "excel" and data.draw(st.booleans()):
+        # What is damaged before it is packed has a right checksum.
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            parts = {info.filename: archive.read(info) for info in archive.infolist()}
+        part = data.draw(st.sampled_from(sorted(parts)))
+        content = packed({**parts, part: data.draw(damaged(parts[part]))})
+    elif isinstance(content, bytes):
+        content = data.draw(damaged(content))
+    else:
+        part = data.draw(st.sampled_from(sorted(content)))
+        content = {**content, part: data.draw(damaged(content[part]))}
+    in_container(content, container, data.draw(st.sampled_from(container.columns)))
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+@settings(FEW, max_examples=8)
+@given(st.data())
+def test_what_is_written_is_read(name, data):
+    check_written(data, name)
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+@settings(FEW, max_examples=8)
+@given(st.data())
+def test_numbers_that_no_sensor_reads_are_refused(name, data):
+    check_written(data, name, NUMBERS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONTAINERS)
+@MANY
+@given(st.data())
+def test_what_is_written_is_read_many(name, data):
+    check_written(data, name, data.draw(st.sampled_from([None, NUMBERS])))
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+@settings(FEW, max_examples=25)
+@given(st.data())
+def test_a_damaged_file_is_read_or_refused(name, data):
+    check_damaged(data, name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONTAINERS)
+@settings(MANY, max_examples=4000)
+@given(st.data())
+def test_a_damaged_file_is_read_or_refused_many(name, data):
+    check_damaged(data, name)
+
+
+# Magic numbers, so that some bytes come past the first look.
+STARTS = st.sampled_from(
+    [b"", b"\x89HDF\r\n\x1a\n", b"PK\x03\x04", b"TDSm", b"\x89MCAP0\r\n", b"SQLite format 3\x00"]
+)
+
+
+@pytest.mark.parametrize("name", [name for name, container in CONTAINERS.items() if container.suffix])
+@settings(FEW, max_examples=15)
+@given(STARTS, st.binary(max_size=400))
+def test_bytes_of_any_kind_are_refused(name, start, content):
+    container = CONTAINERS[name]
+    sound(name, container.layouts[0])
+    assert in_file(start + content, container.suffix, container.columns[0]) is None
+
+
+@settings(FEW, max_examples=15)
+@given(st.sampled_from(["meta/info.json", "data/chunk-000/episode_000000.parquet"]), st.binary(max_size=400))
+def test_a_dataset_of_bytes_of_any_kind_is_refused(name, content):
+    files = sound("lerobot", "v2.1")
+    assert in_container({**files, name: content}, CONTAINERS["lerobot"], LEROBOT) is None
