@@ -5,6 +5,7 @@ Text tables, arrays and tables in memory are those of `test_readers_by_hypothesi
 
 import functools
 import io
+import struct
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping
@@ -27,7 +28,7 @@ from tests.support.random_logs import (
     steady_table,
     tables,
 )
-from tests.support.written_logs import COLUMNS
+from tests.support.written_logs import COLUMNS, refuse
 
 EPOCH_NS = 1_700_000_000 * 10**9
 JOINT = "sensor_msgs/msg/JointState"
@@ -301,3 +302,83 @@ def test_bytes_of_any_kind_are_refused(name, start, content):
 def test_a_dataset_of_bytes_of_any_kind_is_refused(name, content):
     files = sound("lerobot", "v2.1")
     assert in_container({**files, name: content}, CONTAINERS["lerobot"], LEROBOT) is None
+
+
+# Declared sizes: what is not in the file is refused before memory is taken for it, which `outcome` checks.
+
+
+def sheet(rows: str, head: str = "") -> bytes:
+    """Return a workbook whose sheet has these rows as XML."""
+    space = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+    text = f'{head}<worksheet xmlns="{space}">{rows}</worksheet>'.encode()
+    with zipfile.ZipFile(io.BytesIO(xlsx(steady_table(), "plain"))) as archive:
+        parts = {info.filename: archive.read(info) for info in archive.infolist()}
+    return packed({**parts, "xl/worksheets/sheet1.xml": text})
+
+
+def cells(*values, row: int) -> str:
+    """Return a row of a sheet as XML."""
+    parts = [
+        f'<c t="inlineStr"><is><t>{v}</t></is></c>' if isinstance(v, str) else f"<c><v>{v}</v></c>"
+        for v in values
+    ]
+    return f'<row r="{row}">{"".join(parts)}</row>'
+
+
+HEADER_ROW = cells("t", "q", "u", row=1)
+BODY_ROWS = [cells(k / 500, 1.0, 2.0, row=k + 2) for k in range(60)]
+
+
+def refuse_content(content: bytes, container: str, match: str, columns: Mapping | None = None) -> None:
+    """Check that a file is refused with these words, and that little memory was taken."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"log{CONTAINERS[container].suffix}"
+        path.write_bytes(content)
+        columns = CONTAINERS[container].columns[0] if columns is None else columns
+        assert outcome(path, columns) is None
+        refuse(path, columns, match=match)
+
+
+def test_a_sheet_of_a_wrong_dimension_is_read_whole():
+    """Programs other than Excel state the first cell only, or a size of their own."""
+    rows = HEADER_ROW + "".join(BODY_ROWS)
+    for stated in ("A1", "A1:B7", "A1:XFD1048576"):
+        content = sheet(f'<dimension ref="{stated}"/><sheetData>{rows}</sheetData>')
+        log = in_file(content, ".xlsx")
+        assert log is not None
+        assert log.samples == 60
+
+
+def test_a_row_beyond_the_last_one():
+    for place in (2**20 + 1, 10**12):
+        rows = HEADER_ROW + "".join(BODY_ROWS) + cells(1.0, 1.0, 1.0, row=place)
+        content = sheet(f"<sheetData>{rows}</sheetData>")
+        refuse_content(content, "excel", "sheet 'Sheet' has a row after 1048576, the last one of Excel")
+
+
+def test_a_sheet_of_thousands_of_columns():
+    """Each row has one cell in the last column that a name can have: 140 kB of None beside it."""
+    rows = HEADER_ROW + "".join(
+        row.replace("</row>", f'<c r="ZZZ{k + 2}"><v>1</v></c></row>')
+        for k, row in enumerate(cells(k / 500, 1.0, 2.0, row=k + 2) for k in range(4000))
+    )
+    log = in_file(sheet(f"<sheetData>{rows}</sheetData>"), ".xlsx")
+    assert log is not None
+    assert log.samples == 4000
+
+
+def test_entities_that_grow():
+    head = "<!DOCTYPE x [<!ENTITY e0 'ha'>"
+    head += "".join(f"<!ENTITY e{k + 1} '{f'&e{k};' * 10}'>" for k in range(9)) + "]>"
+    rows = HEADER_ROW.replace(">t<", ">&e9;<") + "".join(BODY_ROWS)
+    refuse_content(sheet(f"<sheetData>{rows}</sheetData>", head), "excel", "cannot be read")
+
+
+def test_a_workbook_that_unpacks_to_gigabytes():
+    content = sheet(f"<sheetData>{HEADER_ROW + ' ' * 10_000}</sheetData>")
+    # The directory states the largest size that it can, for the last of its files.
+    at = content.rindex(b"PK\x01\x02")
+    content = content[: at + 24] + struct.pack("<I", 2**32 - 2) + content[at + 28 :]
+    refuse_content(content, "excel", "unpacks from .* to 4096 MiB; at most 1024 MiB")
+    content = content[: at + 24] + struct.pack("<I", 2**27) + content[at + 28 :]
+    refuse_content(content, "excel", "unpacks from .* to 128 MiB; .* 200 times its size")

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-from collections.abc import Iterator, Sequence
+import warnings
+import zipfile
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,9 @@ from jaxid.logs.readers.table import Assumed, Table
 
 # Rows in which a header is looked for, and rows of text that may stand below it.
 _HEADER, _BELOW = 50, 5
+# The last row of a sheet in Excel, and the most that a workbook may unpack to [bytes]; chosen: all rows with
+# 20 columns. XML of numbers packs 5 to 30 times, so what packs better than this is no log.
+_ROWS, _UNPACKED, _PACKED = 2**20, 2**30, 200
 
 
 def read_excel(path: Path, names: list[str], rows: Rows | None) -> Table:
@@ -35,19 +41,41 @@ def _opened(path: Path) -> Iterator[Any]:
         InputError: If the file is no workbook, or is damaged.
     """
     openpyxl = need("openpyxl", path, "Excel")
-    book = None
     try:
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-        yield book
+        _need_size(path)
+        # Opened here, since openpyxl leaves a file open that it cannot read. Its warnings on styles and such
+        # do not matter.
+        with path.open("rb") as file, warnings.catch_warnings(action="ignore"):
+            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+            with contextlib.closing(book):
+                yield book
     except (InputError, OSError):
         raise
     except Exception as error:
         # A damaged archive raises errors of many kinds, also while its rows are read.
         what = f"cannot be read ({cause(error)})"
         raise InputError(what, where=str(path), hint="is it an .xlsx file? save it again") from error
-    finally:
-        if book is not None:
-            book.close()
+
+
+def _need_size(path: Path) -> None:
+    """Refuse a workbook that unpacks to more than any log, before it is unpacked."""
+    with zipfile.ZipFile(path) as archive:
+        # No more than these sizes is unpacked, however much the data would expand to.
+        size = sum(info.file_size for info in archive.infolist())
+    if size > _UNPACKED or size > max(_PACKED * path.stat().st_size, 2**26):
+        what = f"unpacks from {path.stat().st_size / 2**20:.3g} to {size / 2**20:.4g} MiB"
+        hint = f"at most {_UNPACKED / 2**20:g} MiB, and {_PACKED} times its size: save the log as CSV"
+        raise InputError(what, where=str(path), hint=hint)
+
+
+def _rows(sheet: Any, path: Path) -> Iterator[Sequence[Any]]:
+    """Yield the rows of a sheet, whatever size the sheet states of itself: programs write a wrong one."""
+    sheet.reset_dimensions()
+    for k, row in enumerate(sheet.iter_rows(values_only=True)):
+        if k >= _ROWS:
+            what = f"sheet '{sheet.title[:40]}' has a row after {_ROWS}, the last one of Excel"
+            raise InputError(what, where=str(path), hint="save it again")
+        yield row
 
 
 def header_of_book(path: Path) -> list[str]:
@@ -59,7 +87,7 @@ def header_of_book(path: Path) -> list[str]:
     best: list[str] = []
     with _opened(path) as book:
         for sheet in book.worksheets:
-            rows = list(sheet.iter_rows(values_only=True, max_row=_HEADER + _BELOW + 1))
+            rows = list(islice(_rows(sheet, path), _HEADER + _BELOW + 1))
             numbers = [any(_is_number(c) for c in row) for row in rows]
             for k, row in enumerate(rows[:_HEADER]):
                 header = ["" if c is None else str(c).strip() for c in row]
@@ -75,15 +103,15 @@ def _width(header: Sequence[str]) -> int:
 def _of_book(book: Any, path: Path, names: list[str], rows: Rows | None) -> Table:
     known: list[str] = []
     for sheet in book.worksheets:
-        cells = [row for row in sheet.iter_rows(values_only=True)]
-        for k, row in enumerate(cells[:_HEADER]):
+        below = _rows(sheet, path)
+        top = list(islice(below, _HEADER))
+        for k, row in enumerate(top):
             header = ["" if c is None else str(c).strip() for c in row]
             known = header if sum(map(bool, header)) > sum(map(bool, known)) else known
             if all(_places(name, header) for name in names):
                 said = [Assumed("sheet", sheet.title, "the first one with these columns")]
-                return _of_sheet(
-                    cells, k, header, path, names, rows, said if len(book.worksheets) > 1 else []
-                )
+                said = said if len(book.worksheets) > 1 else []
+                return _of_sheet(chain(top[k + 1 :], below), k, header, path, names, rows, said)
     missing = next((name for name in names if not _places(name, known)), names[0])
     raise InputError(
         f"no sheet has the column '{missing}'",
@@ -98,7 +126,7 @@ def _places(name: str, header: Sequence[str]) -> list[int]:
 
 
 def _of_sheet(
-    cells: Sequence[Sequence[Any]],
+    cells: Iterable[Sequence[Any]],
     at: int,
     header: Sequence[str],
     path: Path,
@@ -106,7 +134,7 @@ def _of_sheet(
     rows: Rows | None,
     said: list[Assumed],
 ) -> Table:
-    """Read the columns below a header."""
+    """Read the columns from the rows below a header."""
     columns: dict[str, int] = {}
     for name in names:
         found = _places(name, header)
@@ -114,30 +142,37 @@ def _of_sheet(
             raise InputError(f"has {len(found)} columns '{name}'", where=str(path), hint="rename one of them")
         columns[name] = found[0]
 
-    body = [row for row in cells[at + 1 :] if any(c is not None for c in row)]
+    filled = (row for row in cells if any(c is not None for c in row))
+    first_rows = list(islice(filled, _BELOW + 1))
     below = 0
-    while below < min(_BELOW, len(body)) and not any(_is_number(c) for c in body[below]):
+    while below < min(_BELOW, len(first_rows)) and not any(_is_number(c) for c in first_rows[below]):
         below += 1
 
     units = {name: split_unit(header[k])[1] for name, k in columns.items()}
     if below:
-        shown = ", ".join(str(c) for c in body[0] if c is not None)[:40]
+        shown = ", ".join(str(c) for c in first_rows[0] if c is not None)[:40]
         what = f"{below} row(s) below the header hold no numbers, the first is '{shown}'"
         said.append(Assumed("rows_below_header", below, what))
-        units = {n: u or str(body[0][columns[n]] or "").strip("[]() ") for n, u in units.items()}
+        units = {n: u or str(_cell(first_rows[0], columns[n]) or "").strip("[]() ") for n, u in units.items()}
     if at:
         said.append(Assumed("header", at, f"{at} row(s) above the header are no data"))
-    body = body[below:]
+    # Only the wanted cells are kept: a sheet may have thousands of columns.
+    body = [tuple(_cell(row, k) for k in columns.values()) for row in chain(first_rows[below:], filled)]
     if not body:
         raise InputError("is empty below its header", where=str(path), hint="export the log again")
 
     first, end = resolve_rows(rows, len(body), path)
     out, sparse = {}, set()
-    for name, k in columns.items():
-        values = [row[k] if k < len(row) else None for row in body[first:end]]
+    for place, name in enumerate(columns):
+        values = [row[place] for row in body[first:end]]
         out[name] = _numbers(values, name, first, path)[:, None]
         sparse |= {name} if any(v is None for v in values) else set()
     return Table(out, (first, end), {n: u for n, u in units.items() if u}, tuple(said), frozenset(sparse))
+
+
+def _cell(row: Sequence[Any], k: int) -> Any:
+    """Return a cell of a row; None if the row ends before it."""
+    return row[k] if k < len(row) else None
 
 
 def _is_number(cell: Any) -> bool:
