@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxid.logs.log import read_log
 from tests.support.random_logs import (
     FEW,
     MANY,
@@ -382,3 +383,50 @@ def test_a_workbook_that_unpacks_to_gigabytes():
     refuse_content(content, "excel", "unpacks from .* to 4096 MiB; at most 1024 MiB")
     content = content[: at + 24] + struct.pack("<I", 2**27) + content[at + 28 :]
     refuse_content(content, "excel", "unpacks from .* to 128 MiB; .* 200 times its size")
+
+
+def one_dataset(**options) -> bytes:
+    """Return an HDF5 file in which the position is a dataset made with these options."""
+    h5py = pytest.importorskip("h5py")
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for name in "tu":
+            file[name] = steady_table()[name]
+        file.create_dataset("q", **options)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"shape": (10**13,), "dtype": "f8", "chunks": (1024,)}, r"is 7.45e\+04 GiB large; at most 4 GiB"),
+        ({"shape": (10**8,), "dtype": "f8", "chunks": (1024,)}, "100000000 values, and the file holds 0 "),
+        ({"shape": (10**8,), "dtype": "f8"}, "declares 100000000 values, and the file holds 0 of them"),
+        ({"shape": (10**8,), "dtype": "f8", "chunks": (1024,), "fillvalue": np.nan}, "the file holds 0 of"),
+        ({"shape": (60,), "dtype": np.dtype(("f8", (10**8,)))}, "is 44.7 GiB large"),
+        ({"shape": (60,), "dtype": "S10000000"}, "is not numeric"),
+        ({"shape": (60,), "dtype": np.dtype([("q", "f8"), ("more", "V1000000")])}, "the file holds 0 of"),
+    ],
+    ids=["rows", "chunks", "plain", "nan", "arrays", "text", "table"],
+)
+def test_a_dataset_that_the_file_does_not_hold(options, match):
+    refuse_content(one_dataset(**options), "hdf5", match)
+
+
+def test_a_dataset_that_was_written_in_part(tmp_path):
+    """A recorder makes room, and stops early: HDF5 gives zeros for the rest, which nobody measured."""
+    h5py = pytest.importorskip("h5py")
+    for fill in (0.0, np.nan):
+        with h5py.File(tmp_path / "log.h5", "w") as file:
+            for name, values in steady_table().items():
+                options = {"chunks": (10,), "fillvalue": fill} if name == "q" else {}
+                file.create_dataset(name, shape=(60,), dtype="f8", **options)
+                file[name][: 50 if name == "q" else 60] = values[: 50 if name == "q" else 60]
+        match = "declares 60 values, and the file holds 50" if fill == 0 else r"10 row\(s\) are NaN"
+        refuse(tmp_path / "log.h5", match=match)
+    assert read_log(tmp_path / "log.h5", {**COLUMNS, "rows": [0, 50]}).samples == 50
+
+
+def test_a_dataset_without_a_shape_is_none():
+    h5py = pytest.importorskip("h5py")
+    refuse_content(one_dataset(data=h5py.Empty("f8")), "hdf5", "has no variable 'q'; there is: t, u")

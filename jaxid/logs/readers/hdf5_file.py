@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,8 @@ from jaxid.logs.readers.table import Table
 
 # Attributes in which programs keep the unit of a dataset.
 _UNITS = ("units", "unit", "Unit", "Units", "unit_string")
+# Most values that a dataset may leave out where NaN stands for them [bytes]; chosen: a log that ended early.
+_LEFT_OUT = 2**26
 
 
 def read_hdf5(path: Path, names: list[str], rows: Rows | None) -> Table:
@@ -39,11 +42,39 @@ def read_hdf5(path: Path, names: list[str], rows: Rows | None) -> Table:
                 raise InputError(f"has {len(same)} datasets '{base}'", where=str(path), hint=hint)
             if base in aliases and known[base] is None:
                 dataset, field = found[aliases[base]]
-                need_size(8.0 * dataset.size, f"{path}, dataset '{base}'")
-                known[base] = dataset[field] if field else dataset[()]
+                known[base] = _values(dataset, field, f"{path}, dataset '{base}'")
                 units |= _unit_of(dataset, name)
     columns, taken = pick_columns(path, known, names, rows)
     return Table(columns, taken, units)
+
+
+def _values(dataset: Any, field: str, where: str) -> np.ndarray:
+    """Read a dataset of numbers, or a field of a table, if the file holds as many as it declares.
+
+    Raises:
+        InputError: If it is larger than any log, not numeric, or not in the file.
+    """
+    kind = dataset.dtype[field] if field else dataset.dtype
+    if kind.base.kind not in "fiub":
+        hint = "save it as a plain array of real numbers"
+        raise InputError(f"is not numeric ({kind})", where=where, hint=hint)
+    need_size(float(max(8, kind.itemsize)) * dataset.size, where)
+    held = _held(dataset)
+    left_out = dataset.size - held
+    known_gaps = not field and kind.kind == "f" and np.isnan(dataset.fillvalue)
+    if left_out > 0 and not (known_gaps and left_out * kind.itemsize <= _LEFT_OUT):
+        what = f"declares {dataset.size} values, and the file holds {held} of them"
+        raise InputError(what, where=where, hint="export the log again, without the rest")
+    return dataset[field] if field else dataset[()]
+
+
+def _held(dataset: Any) -> int:
+    """Return how many values of a dataset were written; HDF5 gives zeros for the others."""
+    if dataset.is_virtual:
+        return dataset.size
+    if dataset.chunks is not None:
+        return min(dataset.id.get_num_chunks() * math.prod(dataset.chunks), dataset.size)
+    return min(dataset.id.get_storage_size() // dataset.dtype.itemsize, dataset.size)
 
 
 def datasets_of(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
@@ -87,7 +118,8 @@ def _datasets(file: Any, h5py: Any) -> dict[str, tuple[Any, str]]:
     found: dict[str, tuple[Any, str]] = {}
 
     def visit(name: str, entry: Any) -> None:
-        if not isinstance(entry, h5py.Dataset) or name.startswith("#"):
+        # A dataset without a shape holds nothing.
+        if not isinstance(entry, h5py.Dataset) or name.startswith("#") or entry.shape is None:
             return
         fields = entry.dtype.names or ()
         found.update({f"{name}/{field}": (entry, field) for field in fields} or {name: (entry, "")})
