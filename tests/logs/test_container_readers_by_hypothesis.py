@@ -94,8 +94,7 @@ def tdms(table, layout: str) -> bytes:
             channels = []
             for name, values in table.items():
                 properties = {"unit_string": "", "wf_start_offset": 0.0, "wf_increment": float(table["t"][1])}
-                values = values.astype(values.dtype)[part]
-                channels.append(nptdms.ChannelObject("axis", name, values, properties=properties))
+                channels.append(nptdms.ChannelObject("axis", name, values[part], properties=properties))
             writer.write_segment(channels)
     return buffer.getvalue()
 
@@ -430,3 +429,56 @@ def test_a_dataset_that_was_written_in_part(tmp_path):
 def test_a_dataset_without_a_shape_is_none():
     h5py = pytest.importorskip("h5py")
     refuse_content(one_dataset(data=h5py.Empty("f8")), "hdf5", "has no variable 'q'; there is: t, u")
+
+
+def waveforms(**changed) -> bytes:
+    """Return a TDMS file of two rates, whose times are properties, with other values or properties of `q`."""
+    nptdms = pytest.importorskip("nptdms")
+    buffer = io.BytesIO()
+    with nptdms.TdmsWriter(buffer) as writer:
+        for name, count, step in (("q", 300, 0.002), ("u", 60, 0.01)):
+            properties = {"wf_increment": step, "wf_start_offset": 0.0}
+            properties |= changed.get("properties", {}) if name == "q" else {}
+            values = changed.get("values", np.arange(300) / 300) if name == "q" else np.ones(count)
+            writer.write_segment([nptdms.ChannelObject("axis", name, values, properties=properties)])
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("changed", "match"),
+    [
+        ({"values": ["text"] * 300}, "channel 'q': is not numeric"),
+        ({"values": np.full(300, np.nan)}, "row.s. are NaN or infinite"),
+        ({"properties": {"wf_increment": np.inf}}, r"has 0 reading\(s\)"),
+        ({"properties": {"wf_increment": "fast"}}, "cannot be read"),
+        ({"properties": {"wf_increment": 0.0}}, r"has 1 reading\(s\)"),
+    ],
+    ids=["text", "nan", "inf", "word", "zero"],
+)
+def test_waveforms_of_no_numbers(changed, match):
+    wave = {**COLUMNS, "time": "wf_time"}
+    assert in_file(waveforms(), ".tdms", wave) is not None
+    refuse_content(waveforms(**changed), "tdms", match, wave)
+
+
+@pytest.mark.parametrize("count", [10**8, 2**40, 2**64 - 1])
+@pytest.mark.parametrize("kind", ["numbers", "text"])
+def test_a_channel_that_declares_values_that_the_file_does_not_have(count, kind):
+    values = [f"{k}" for k in range(60)] if kind == "text" else steady_table()["q"]
+    content = tdms({**steady_table(), "q": values}, "plain")
+    # The number of values stands behind the length of the index, the kind and the dimension.
+    at = content.index(b"/'axis'/'q'") + len("/'axis'/'q'") + 12
+    assert struct.unpack("<Q", content[at : at + 8]) == (60,)
+    changed = content[:at] + struct.pack("<Q", count) + content[at + 8 :]
+    refuse_content(changed, "tdms", "declares|cannot be read|is empty|not numeric|unequal lengths")
+
+
+def test_a_tdms_file_that_was_not_closed_is_read_and_said(capfd):
+    """LabVIEW writes the length of a segment when it ends; npTDMS then writes lines of its own on stderr."""
+    content = tdms(steady_table(), "plain")
+    open_end = content[:12] + b"\xff" * 8 + content[20:]
+    log = in_file(open_end, ".tdms")
+    assert log is not None
+    assert [a.setting for a in log.assumed if a.value == "incomplete"] == ["last_segment"]
+    refuse_content(open_end[:-9], "tdms", "unequal lengths: 't' 60, 'q' 60, 'u' 58")
+    assert capfd.readouterr().err == ""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +27,16 @@ def read_tdms(path: Path, names: list[str], rows: Rows | None) -> Table:
     time that the properties wf_start_offset and wf_increment of the channels give.
     """
     nptdms = need("nptdms", path, "TDMS")
+    said: list[Assumed] = []
     try:
-        with path.open("rb") as raw, nptdms.TdmsFile.open(raw) as file:
+        with _quiet(), path.open("rb") as raw, nptdms.TdmsFile.open(raw) as file:
             channels = _channels(file)
             found = {name: _channel(name, channels, path) for name in names if name != WAVEFORM_TIME}
             for name, channel in found.items():
-                need_size(8.0 * len(channel), f"{path}, channel '{name}'")
-            values = {name: np.asarray(channel[:]) for name, channel in found.items()}
+                _need_held(channel, path, f"{path}, channel '{name}'")
+            if file.file_status.incomplete_final_segment:
+                said.append(Assumed("last_segment", "incomplete", "the file ends early, and is read so far"))
+            values = {name: _numbers(channel, f"{path}, channel '{name}'") for name, channel in found.items()}
             tracks = {name: _track(c, path) for name, c in found.items()} if WAVEFORM_TIME in names else {}
             units = {
                 n: str(c.properties["unit_string"])
@@ -44,23 +50,48 @@ def read_tdms(path: Path, names: list[str], rows: Rows | None) -> Table:
         what = f"cannot be read ({cause(error)})"
         raise InputError(what, where=str(path), hint="is it a TDMS file? export it again") from error
 
-    values = {name: _seconds(v) for name, v in values.items()}
-    said: tuple[Assumed, ...] = ()
     sparse: frozenset[str] = frozenset()
     if tracks:
-        said = (
-            Assumed("time", WAVEFORM_TIME, "of the channels' properties wf_start_offset and wf_increment"),
-        )
+        reason = "of the channels' properties wf_start_offset and wf_increment"
+        said.append(Assumed("time", WAVEFORM_TIME, reason))
         first = next(iter(tracks.values()))
         if all(np.array_equal(first, t) for t in tracks.values()):
             values[WAVEFORM_TIME] = first
         else:
+            whole = frozenset(name for name, v in values.items() if not np.isnan(v).any())
             time, columns = on_one_time({n: (t, values[n][:, None]) for n, t in tracks.items()})
             values = {WAVEFORM_TIME: time, **columns}
-            sparse = frozenset(columns)
+            # A time without a reading is none; NaN in a channel is a fault, as in any other format.
+            sparse = whole
 
     columns, taken = pick_columns(path, values, names, rows)
-    return Table(columns, taken, units, said, sparse)
+    return Table(columns, taken, units, tuple(said), sparse)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the lines from stderr that npTDMS writes there of itself."""
+    from nptdms.log import log_manager
+
+    level = log_manager.log_level
+    log_manager.set_level(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        log_manager.set_level(level)
+
+
+def _need_held(channel: Any, path: Path, where: str) -> None:
+    """Refuse a channel that declares more values than its file has bytes, before memory is taken for it.
+
+    Raises:
+        InputError: If it does, or is larger than any log.
+    """
+    size = path.stat().st_size
+    if len(channel) > size:
+        what = f"declares {len(channel)} values, and the file has {size} bytes"
+        raise InputError(what, where=where, hint="export it again")
+    need_size(8.0 * len(channel), where)
 
 
 def _channels(file: Any) -> dict[str, list[Any]]:
@@ -85,7 +116,9 @@ def _channel(name: str, channels: dict[str, list[Any]], path: Path) -> Any:
 def _track(channel: Any, path: Path) -> np.ndarray:
     """Return the times of a channel that its waveform properties give [s]."""
     try:
-        return np.asarray(channel.time_track(), dtype=np.float64)
+        # Properties that are no numbers make times that are none, which are refused with their row.
+        with np.errstate(all="ignore"):
+            return np.asarray(channel.time_track(), dtype=np.float64)
     except KeyError as error:
         hint = "name a channel as time, or give sample_rate"
         raise InputError(
@@ -93,8 +126,16 @@ def _track(channel: Any, path: Path) -> np.ndarray:
         ) from error
 
 
-def _seconds(values: np.ndarray) -> np.ndarray:
-    """Return time stamps as seconds since the first one, and numbers as they are."""
-    if values.dtype.kind != "M":
-        return values
-    return (values - values[0]).astype("timedelta64[ns]").astype(np.float64) * 1e-9
+def _numbers(channel: Any, where: str) -> np.ndarray:
+    """Read the numbers of a channel; time stamps as seconds since the first one.
+
+    Raises:
+        InputError: If they are not numbers.
+    """
+    values = np.asarray(channel[:])
+    if values.dtype.kind == "M":
+        return (values - values[:1]).astype("timedelta64[ns]").astype(np.float64) * 1e-9
+    if values.dtype.kind not in "fiub":
+        hint = "name a channel of real numbers"
+        raise InputError(f"is not numeric ({values.dtype})", where=where, hint=hint)
+    return values
