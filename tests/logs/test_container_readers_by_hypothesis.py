@@ -5,6 +5,7 @@ Text tables, arrays and tables in memory are those of `test_readers_by_hypothesi
 
 import functools
 import io
+import json
 import struct
 import tempfile
 import zipfile
@@ -202,7 +203,7 @@ def in_container(content: bytes | Mapping[str, bytes], container: Container, col
         for name, part in content.items():
             (Path(folder) / name).parent.mkdir(parents=True, exist_ok=True)
             (Path(folder) / name).write_bytes(part)
-        return outcome(folder, columns)
+        return outcome(Path(folder), columns)
 
 
 def check_written(data, name: str, numbers=None) -> None:
@@ -482,3 +483,59 @@ def test_a_tdms_file_that_was_not_closed_is_read_and_said(capfd):
     assert [a.setting for a in log.assumed if a.value == "incomplete"] == ["last_segment"]
     refuse_content(open_end[:-9], "tdms", "unequal lengths: 't' 60, 'q' 60, 'u' 58")
     assert capfd.readouterr().err == ""
+
+
+def dataset_with(**changed) -> dict[str, bytes]:
+    """Return a LeRobot dataset whose info.json has other entries."""
+    files = sound("lerobot", "v2.1")
+    info = json.loads(files["meta/info.json"])
+    return {**files, "meta/info.json": json.dumps({**info, **changed}).encode()}
+
+
+FEATURE = {"dtype": "float64", "shape": [2], "names": ["shoulder_pan.pos", "elbow_flex.pos"]}
+FEATURES = {"observation.state": FEATURE, "action": FEATURE, "timestamp": {"dtype": "float64", "shape": [1]}}
+
+
+@pytest.mark.parametrize(
+    "features",
+    [
+        None,
+        ["observation.state", "action", "timestamp"],
+        {**FEATURES, "action": 5},
+        {**FEATURES, "action": {**FEATURE, "shape": ["a"]}},
+        {**FEATURES, "action": {**FEATURE, "shape": 2}},
+        {**FEATURES, "action": {**FEATURE, "shape": [float("inf")]}},
+    ],
+    ids=["none", "list", "number", "word", "no list", "infinite"],
+)
+def test_an_info_of_other_kinds(features):
+    assert in_container(dataset_with(features=FEATURES), CONTAINERS["lerobot"], LEROBOT) is not None
+    assert in_container(dataset_with(features=features), CONTAINERS["lerobot"], LEROBOT) is None
+
+
+@pytest.mark.parametrize("names", [5, "ab", {"motors": 7}, {}, [["a", "b"]], [None, {}]])
+def test_names_of_other_kinds_are_none(names):
+    files = dataset_with(features={**FEATURES, "action": {**FEATURE, "names": names}})
+    assert in_container(files, CONTAINERS["lerobot"], LEROBOT) is not None
+
+
+def test_an_info_that_is_nested_deep():
+    files = {**sound("lerobot", "v2.1"), "meta/info.json": b'{"features":' + b"[" * 200_000}
+    assert in_container(files, CONTAINERS["lerobot"], LEROBOT) is None
+
+
+def test_an_entry_that_the_data_do_not_have(tmp_path):
+    wide = {**FEATURE, "shape": [3], "names": [*FEATURE["names"], "gripper.pos"]}
+    for name, content in dataset_with(features={**FEATURES, "action": wide}).items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    columns = {**LEROBOT, "force": "action[gripper.pos]"}
+    refuse(tmp_path, columns, match=r"'action\[gripper.pos\]' is entry 3, and the data have 2")
+
+
+def test_a_dataset_of_more_rows_than_any_log(monkeypatch):
+    """Parquet packs equal numbers to nothing: the rows that it declares are looked at first."""
+    monkeypatch.setattr("jaxid.logs.readers.array_files._LARGEST", 100)
+    assert in_container(sound("lerobot", "v3.0"), CONTAINERS["lerobot"], LEROBOT) is None
+    monkeypatch.setattr("jaxid.logs.readers.array_files._LARGEST", 480)
+    assert in_container(sound("lerobot", "v3.0"), CONTAINERS["lerobot"], LEROBOT) is not None

@@ -117,3 +117,17 @@ def test_what_lists_no_columns(tmp_path):
     (tmp_path / "log.csv").write_text("0.0,1.0\n0.1,2.0\n")
     with pytest.raises(InputError, match="no header row"):
         contents_of(tmp_path / "log.csv")
+
+
+def test_the_shapes_of_an_archive_are_read_without_its_arrays(tmp_path):
+    """An array of objects is no column, and no reason to refuse the others."""
+    np.savez(tmp_path / "log.npz", t=T, q=T, more=np.array([{}] * T.size, dtype=object))
+    assert contents_of(tmp_path / "log.npz").names == ("t", "q")
+
+
+@pytest.mark.parametrize("suffix", ["npz", "mat", "parquet", "tdms", "h5", "xlsx", "mcap"])
+def test_a_file_that_is_none_of_its_suffix_lists_no_columns(tmp_path, suffix):
+    (tmp_path / f"log.{suffix}").write_bytes(b"this is no such file" * 20)
+    with pytest.raises(InputError, match=r"cannot be read \(.*\); ") as caught:
+        contents_of(tmp_path / f"log.{suffix}")
+    assert "\n" not in str(caught.value)

@@ -3,8 +3,9 @@
 import resource
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hypothesis import HealthCheck, settings
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import as_log
 from jaxid.logs.log import Log
+from jaxid.logs.readers.contents import contents_of
 from tests.support.written_logs import COLUMNS
 
 # Few in CI; `-m slow` takes many.
@@ -72,22 +74,29 @@ def damaged(draw, sound: bytes):
 
 
 def outcome(source, columns: Mapping = COLUMNS) -> Log | None:
-    """Return the log, or None if it is refused in one line; anything else fails."""
+    """Return the log, or None if it is refused in one line; anything else fails.
+
+    The columns of a file are listed too, as `init` does, or that is refused in one line.
+    """
+    if isinstance(source, Path):
+        _answer(lambda: contents_of(source))
+    log = _answer(lambda: as_log(source, columns))
+    assert log is None or np.all(np.isfinite(np.column_stack([log.time, log.position, log.force])))
+    return log
+
+
+def _answer(read: Callable[[], Any]) -> Any:
+    """Return what is read, or None if it is refused in one line, with little memory and time for it."""
     memory, start = _peak(), time.monotonic()
     try:
-        log = as_log(source, columns)
+        found, line = read(), ""
     except InputError as error:
-        line = str(error)
-    else:
-        line = ""
+        found, line = None, str(error)
     assert "\n" not in line
     assert len(line) < 1000
     assert _peak() - memory < MOST_MEMORY
     assert time.monotonic() - start < MOST_SECONDS
-    if line:
-        return None
-    assert np.all(np.isfinite(np.column_stack([log.time, log.position, log.force])))
-    return log
+    return found
 
 
 def _peak() -> int:

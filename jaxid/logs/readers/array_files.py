@@ -51,19 +51,25 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> np.nd
     where = f"{path}, variable '{info.filename.removesuffix('.npy')}'"
     # The archive reads no more than this size states, however much its data would expand to.
     need_size(info.file_size, where)
+    shape, kind = header_of(archive, info)
+    if kind.hasobject:
+        hint = "save it as a plain array of real numbers"
+        raise InputError("is not numeric (object)", where=where, hint=hint)
+    declared = math.prod(shape) * kind.itemsize
+    if declared > info.file_size:
+        what = f"declares the shape {shape}, and its data are {info.file_size} bytes"
+        raise InputError(what, where=where, hint="save the log again")
+    with archive.open(info) as file:
+        return npy.read_array(file, allow_pickle=False)
+
+
+def header_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:
+    """Return the shape and the type that an array of an archive declares, without reading it."""
     with archive.open(info) as file:
         version = npy.read_magic(file)
         header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, _, kind = header(file)
-        if kind.hasobject:
-            hint = "save it as a plain array of real numbers"
-            raise InputError("is not numeric (object)", where=where, hint=hint)
-        declared = math.prod(shape) * kind.itemsize
-        if declared > info.file_size:
-            what = f"declares the shape {shape}, and its data are {info.file_size} bytes"
-            raise InputError(what, where=where, hint="save the log again")
-    with archive.open(info) as file:
-        return npy.read_array(file, allow_pickle=False)
+        return shape, kind
 
 
 def need_size(size: float, where: str) -> None:

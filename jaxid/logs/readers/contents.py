@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,16 +11,17 @@ from typing import Any
 import numpy as np
 
 from jaxid.errors import InputError, cause
-from jaxid.logs.readers import READERS, reader_of
+from jaxid.logs.readers import READERS, Reader, reader_of
+from jaxid.logs.readers.array_files import header_of
 from jaxid.logs.readers.csv_file import dialect_of, read_csv
 from jaxid.logs.readers.dialect import Dialect, bare, cells_of, split_unit
 from jaxid.logs.readers.excel_file import header_of_book
 from jaxid.logs.readers.extras import need
 from jaxid.logs.readers.hdf5_file import datasets_of, read_hdf5
-from jaxid.logs.readers.lerobot import INFO, read_lerobot, root_of
+from jaxid.logs.readers.lerobot import info_of, read_lerobot, root_of
 from jaxid.logs.readers.mat_file import MatFile
 from jaxid.logs.readers.ros_bag import HEADER, JOINT_VECTORS, read_ros
-from jaxid.logs.readers.tdms_file import WAVEFORM_TIME, read_tdms
+from jaxid.logs.readers.tdms_file import WAVEFORM_TIME, quiet, read_tdms
 from jaxid.logs.units import parse_unit
 
 # Most entries of an array in a message that count as columns: longer ones are pictures and clouds.
@@ -56,6 +56,17 @@ def contents_of(path: Path) -> Contents:
         InputError: If the file cannot be read, or its format lists no columns.
     """
     reader = reader_of(path, None)
+    try:
+        return _of_reader(path, reader)
+    except InputError:
+        raise
+    except Exception as error:
+        # A damaged file raises errors of a dozen kinds.
+        hint = "is it a log of its suffix? export it again"
+        raise InputError(f"cannot be read ({cause(error)})", where=str(path), hint=hint) from error
+
+
+def _of_reader(path: Path, reader: Reader) -> Contents:
     if reader is read_csv:
         return _of_text(path)
     if reader is read_ros:
@@ -142,10 +153,10 @@ def _line_above(lines: Sequence[str], dialect: Dialect) -> list[str] | None:
 
 def _of_archive(path: Path) -> Iterator[str]:
     with zipfile.ZipFile(path) as archive:
-        names = [info.filename.removesuffix(".npy") for info in archive.infolist()]
-    with np.load(path, allow_pickle=False) as arrays:
-        for name in names:
-            yield from _columns(name, arrays[name].shape)
+        for info in archive.infolist():
+            shape, kind = header_of(archive, info)
+            if not kind.hasobject:
+                yield from _columns(info.filename.removesuffix(".npy"), shape)
 
 
 def _columns(name: str, shape: Sequence[int]) -> Iterator[str]:
@@ -181,7 +192,7 @@ def _of_hdf5(path: Path) -> Contents:
 def _of_tdms(path: Path) -> Contents:
     nptdms = need("nptdms", path, "TDMS")
     names, units, waveform = [], {}, False
-    with nptdms.TdmsFile.open(path) as file:
+    with quiet(), path.open("rb") as raw, nptdms.TdmsFile.open(raw) as file:
         for group in file.groups():
             for channel in group.channels():
                 name = f"{group.name}/{channel.name}"
@@ -195,17 +206,14 @@ def _of_tdms(path: Path) -> Contents:
 def _of_lerobot(path: Path) -> Contents:
     root = root_of(path)
     assert root is not None, "the caller found the dataset"
-    info = json.loads((root / INFO).read_text())
+    info = info_of(root)
     names: list[str] = []
-    for feature, about in info["features"].items():
-        if not (feature == "timestamp" or str(about.get("dtype", "")).startswith("float")):
-            continue
-        entries = about.get("names") or []
-        entries = next(iter(entries.values()), []) if isinstance(entries, dict) else entries
-        width = int(np.prod(about.get("shape") or [1]))
-        entries = entries if len(entries) == width else range(1, width + 1)
-        names += [feature] if width == 1 else [f"{feature}[{entry}]" for entry in entries]
-    return Contents(tuple(names), {}, "timestamp", int(info.get("total_episodes") or 1))
+    for name, feature in info.features.items():
+        if name == "timestamp" or feature.kind.startswith("float"):
+            named = len(feature.entries) == feature.width
+            entries = feature.entries if named else range(1, min(feature.width, _MOST_ENTRIES) + 1)
+            names += [name] if feature.width == 1 else [f"{name}[{entry}]" for entry in entries]
+    return Contents(tuple(names), {}, "timestamp", info.episodes)
 
 
 def _of_ros(path: Path) -> Contents:

@@ -29,7 +29,7 @@ def read_tdms(path: Path, names: list[str], rows: Rows | None) -> Table:
     nptdms = need("nptdms", path, "TDMS")
     said: list[Assumed] = []
     try:
-        with _quiet(), path.open("rb") as raw, nptdms.TdmsFile.open(raw) as file:
+        with quiet(), path.open("rb") as raw, nptdms.TdmsFile.open(raw) as file:
             channels = _channels(file)
             found = {name: _channel(name, channels, path) for name in names if name != WAVEFORM_TIME}
             for name, channel in found.items():
@@ -69,7 +69,7 @@ def read_tdms(path: Path, names: list[str], rows: Rows | None) -> Table:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep the lines from stderr that npTDMS writes there of itself."""
     from nptdms.log import log_manager
 
