@@ -3,9 +3,11 @@
 Text tables, arrays and tables in memory are those of `test_readers_by_hypothesis.py`.
 """
 
+import contextlib
 import functools
 import io
 import json
+import sqlite3
 import struct
 import tempfile
 import zipfile
@@ -539,3 +541,84 @@ def test_a_dataset_of_more_rows_than_any_log(monkeypatch):
     assert in_container(sound("lerobot", "v3.0"), CONTAINERS["lerobot"], LEROBOT) is None
     monkeypatch.setattr("jaxid.logs.readers.array_files._LARGEST", 480)
     assert in_container(sound("lerobot", "v3.0"), CONTAINERS["lerobot"], LEROBOT) is not None
+
+
+def record(kind: int, content: bytes) -> bytes:
+    """Return a record of an MCAP."""
+    return struct.pack("<BQ", kind, len(content)) + content
+
+
+def text(content: bytes) -> bytes:
+    return struct.pack("<I", len(content)) + content
+
+
+def mcap_of_one_chunk(data: bytes, compression: bytes, size: int) -> bytes:
+    """Return an MCAP without a summary, with one chunk that declares this size."""
+    magic = b"\x89MCAP0\r\n"
+    fixed = struct.pack("<QQQI", 0, 10**9, size, 0)
+    chunk = record(6, fixed + text(compression) + struct.pack("<Q", len(data)) + data)
+    return magic + record(1, text(b"ros2") + text(b"")) + chunk + record(2, bytes(20)) + magic
+
+
+def zeros(compression: str, count: int) -> bytes:
+    """Return a packed record of an unknown kind that has this many bytes, all zero, made a part at a time."""
+    if compression == "lz4":
+        packer = pytest.importorskip("lz4.frame").LZ4FrameCompressor()
+        parts = [packer.begin()]
+    else:
+        packer = pytest.importorskip("backports.zstd").ZstdCompressor()
+        parts = []
+    parts.append(packer.compress(struct.pack("<BQ", 0x80, count - 9)))
+    part = bytes(2**20)
+    parts += [packer.compress(part) for _ in range(count // len(part))]
+    return b"".join([*parts, packer.compress(part[: count % len(part) - 9]), packer.flush()])
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd"])
+def test_a_chunk_that_unpacks_to_gigabytes(compression):
+    sound("foxglove", "lz4")
+    size = 2**30 + 20
+    data = zeros(compression, size)
+    assert len(data) < 2**23
+    kind = compression.encode()
+    refuse_content(mcap_of_one_chunk(data, kind, size), "mcap", "has a chunk that declares 1024 MiB")
+    refuse_content(mcap_of_one_chunk(data, kind, 2**60), "mcap", "chunk that declares .* at most 256 MiB")
+    match = "a chunk that unpacks to more than the 2000 bytes that it declares"
+    refuse_content(mcap_of_one_chunk(data, kind, 2000), "mcap", match)
+
+
+@pytest.mark.parametrize("size", [2**31, 2**40, 2**63 - 1, 2**64 - 1])
+def test_lengths_of_records_that_the_file_does_not_have(size):
+    sound("foxglove", "lz4")
+    content = mcap_of_one_chunk(b"", b"", 0)
+    refuse_content(content, "mcap", "has no topic")
+    # The header is the first record, and the chunk is the next one.
+    header = 9 + 8 + struct.unpack("<Q", content[9:17])[0]
+    assert content[header] == 6
+    for at in (9, header + 1):
+        changed = content[:at] + struct.pack("<Q", size) + content[at + 8 :]
+        refuse_content(changed, "mcap", "cannot be read")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ("UPDATE messages SET data = 1000000000 WHERE id = 1", "cannot be read"),
+        ("UPDATE messages SET data = zeroblob(1000000) WHERE id = 1", "cannot be read|no entry"),
+        ("UPDATE messages SET data = 'text'", "cannot be read"),
+        ("UPDATE messages SET timestamp = 'noon' WHERE id = 5", "cannot be read"),
+        ("UPDATE messages SET timestamp = 9e18 WHERE id = 5", "which no clock gives"),
+        ("UPDATE topics SET type = 'std_msgs/msg/Nothing'", "cannot be read"),
+        ("UPDATE topics SET name = 7", "cannot be read|has no topic"),
+        ("UPDATE message_definitions SET encoded_message_definition = 'int32 a'", "cannot be read|have no"),
+        ("DELETE FROM messages", "has no topic"),
+        ("DROP TABLE messages", "cannot be read"),
+    ],
+)
+def test_a_database_with_other_contents(tmp_path, change, match):
+    (tmp_path / "log.db3").write_bytes(sound("db3", "db3 two"))
+    with contextlib.closing(sqlite3.connect(tmp_path / "log.db3")) as database:
+        database.execute(change)
+        database.commit()
+    assert outcome(tmp_path / "log.db3", ROS) is None
+    refuse(tmp_path / "log.db3", ROS, match=match)

@@ -20,7 +20,7 @@ from jaxid.logs.readers.extras import need
 from jaxid.logs.readers.hdf5_file import datasets_of, read_hdf5
 from jaxid.logs.readers.lerobot import info_of, read_lerobot, root_of
 from jaxid.logs.readers.mat_file import MatFile
-from jaxid.logs.readers.ros_bag import HEADER, JOINT_VECTORS, read_ros
+from jaxid.logs.readers.ros_bag import HEADER, JOINT_VECTORS, need_chunks, read_ros
 from jaxid.logs.readers.tdms_file import WAVEFORM_TIME, quiet, read_tdms
 from jaxid.logs.units import parse_unit
 
@@ -221,6 +221,7 @@ def _of_ros(path: Path) -> Contents:
     typesys = need("rosbags.typesys", path, "a ROS recording")
     names: list[str] = []
     try:
+        need_chunks(path)
         store = typesys.get_typestore(typesys.Stores.LATEST)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
             for topic, info in reader.topics.items():

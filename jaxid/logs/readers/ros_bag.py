@@ -7,8 +7,10 @@ the offset and the drift between computers, and all but the shortest of the tran
 
 from __future__ import annotations
 
+import importlib
 import re
 import struct
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +34,8 @@ _NAME = re.compile(r"(?P<topic>[^.]+)\.(?P<field>[^\[\]]+)(\[(?P<entry>.+)\])?$"
 _PART = 20_000
 # Offset between two clocks that is reported [s], and their drift.
 _OFFSET, _DRIFT = 1e-3, 1e-5
+# Largest chunk of an MCAP [bytes]; chosen: 300 times that of ROS.
+_CHUNK = 2**28
 # Nanoseconds in a second. Stamps are counted in whole ones: as seconds since 1970 they would have 0.2 us.
 _SECOND = 10**9
 # Stamp of a message without header, and the last one that a recorder gives: the year 2116 [ns].
@@ -77,6 +81,7 @@ def read_ros(path: Path, names: list[str], rows: Rows | None) -> Table:
     wanted = {name: _column(name, path) for name in names if name not in clocks}
 
     try:
+        need_chunks(path)
         store = typesys.get_typestore(typesys.Stores.LATEST)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
             _check_topics(wanted, reader, path)
@@ -105,6 +110,68 @@ def read_ros(path: Path, names: list[str], rows: Rows | None) -> Table:
     # A time without a message is no reading; NaN in a message is a fault, as in any other format.
     whole = frozenset(name for name, (_, values) in readings.items() if not np.isnan(values).any())
     return Table(picked, taken, {}, tuple(said), whole)
+
+
+def need_chunks(path: Path) -> None:
+    """Refuse an MCAP with a chunk that unpacks to more than it declares, or to more than chunks have.
+
+    The library unpacks a chunk at once, and compares its size with the declared one afterwards.
+
+    Args:
+        path: A file, or the folder of a rosbag2; files of other formats have no chunks.
+
+    Raises:
+        InputError: If there is such a chunk.
+    """
+    for file in [path] if path.is_file() else sorted(path.glob("*.mcap")):
+        for size, compression, data in _chunks(file) if file.suffix.lower() == ".mcap" else ():
+            if size > _CHUNK:
+                what = f"has a chunk that declares {size / 2**20:.4g} MiB"
+                hint = f"at most {_CHUNK / 2**20:g} MiB: record it with smaller chunks"
+                raise InputError(what, where=str(file), hint=hint)
+            if not _unpacks_to(data, compression, size):
+                what = f"has a chunk that unpacks to more than the {size} bytes that it declares"
+                raise InputError(what, where=str(file), hint="record it again")
+
+
+def _chunks(file: Path) -> Iterator[tuple[int, bytes, bytes]]:
+    """Yield declared size, compression and data of each chunk of an MCAP, up to a record that is cut off.
+
+    Source:
+        MCAP, "Format specification": records of a byte of kind and 8 of length, chunks are kind 6.
+    """
+    whole = file.stat().st_size
+    with file.open("rb") as raw:
+        at = len(b"\x89MCAP0\r\n")
+        while at + 9 <= whole:
+            raw.seek(at)
+            kind, length = struct.unpack("<BQ", raw.read(9))
+            at += 9 + length
+            if kind == 6 and length >= 40 and at <= whole:
+                size, _, name = struct.unpack("<QII", raw.read(32)[16:])
+                compression = raw.read(min(name, length))
+                packed = int.from_bytes(raw.read(8), "little")
+                yield size, compression, raw.read(min(packed, length))
+
+
+def _unpacks_to(data: bytes, compression: bytes, size: int) -> bool:
+    """Check that data unpack to at most this size, a part at a time; the library refuses damaged ones."""
+    if compression == b"zstd":
+        known = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
+        unpacker = importlib.import_module(known).ZstdDecompressor()
+    elif compression == b"lz4":
+        unpacker = importlib.import_module("lz4.frame").LZ4FrameDecompressor()
+    else:
+        return True
+    try:
+        while not unpacker.eof and size >= 0:
+            part = unpacker.decompress(data, max_length=2**20)
+            if not part and unpacker.needs_input:
+                break
+            size, data = size - len(part), b""
+    except Exception:
+        return True
+    return size >= 0
 
 
 def _column(name: str, path: Path) -> _Column:
