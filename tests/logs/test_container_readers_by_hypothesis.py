@@ -106,27 +106,61 @@ def stamps(table) -> list[int]:
     return [EPOCH_NS + round(float(t) * 1e9) for t in table["t"]]
 
 
-def bag(table, layout: str) -> bytes:
-    """Return the one file of a rosbag2, as the writer of rosbags makes it."""
-    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+JOINTS = {"one": ["elbow"], "two": ["shoulder", "elbow"], "odd": ["a", "elbow", "längeres"]}
+
+
+def states(table, joints: str):
+    """Yield recorded time [ns] and joint state of each row; joints beside the elbow have other numbers."""
+    written = pytest.importorskip("tests.logs.test_formats")
+    names = JOINTS[joints]
+    at = names.index("elbow")
+    for stamp, q, u in zip(stamps(table), table["q"], table["u"], strict=True):
+        values = [[0.0] * at + [float(x)] + [1.0] * (len(names) - at - 1) for x in (q, u)]
+        message = written.joint_state(written.STORE, 0.0, names, *values)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        yield stamp, message
+
+
+def rosbag2(table, layout: str) -> dict[str, bytes]:
+    """Return the files of a rosbag2, as the writer of rosbags makes it."""
+    library = pytest.importorskip("rosbags.rosbag2")
     written = pytest.importorskip("tests.logs.test_formats")
     container, joints = layout.split()
-    plugin = rosbag2.StoragePlugin.SQLITE3 if container == "db3" else rosbag2.StoragePlugin.MCAP
-    names = {"one": ["elbow"], "two": ["shoulder", "elbow"], "odd": ["a", "elbow", "längeres"]}[joints]
-    at = names.index("elbow")
+    plugin = library.StoragePlugin.SQLITE3 if container == "db3" else library.StoragePlugin.MCAP
     with tempfile.TemporaryDirectory() as folder:
-        writer = rosbag2.Writer(Path(folder) / "bag", version=8, storage_plugin=plugin)
+        writer = library.Writer(Path(folder) / "bag", version=8, storage_plugin=plugin)
         if container == "zstd":
-            writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
+            writer.set_compression(library.CompressionMode.STORAGE, library.CompressionFormat.ZSTD)
         with writer:
             connection = writer.add_connection("/joint_states", JOINT, typestore=written.STORE)
-            for stamp, q, u in zip(stamps(table), table["q"], table["u"], strict=True):
-                values = [[0.0] * at + [float(x)] + [1.0] * (len(names) - at - 1) for x in (q, u)]
-                message = written.joint_state(written.STORE, 0.0, names, *values)
-                message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+            for stamp, message in states(table, joints):
                 writer.write(connection, stamp, written.STORE.serialize_cdr(message, JOINT))
-        [file] = [p for p in (Path(folder) / "bag").iterdir() if p.suffix in (".db3", ".mcap")]
-        return file.read_bytes()
+        return {p.name: p.read_bytes() for p in sorted((Path(folder) / "bag").iterdir())}
+
+
+def bag(table, layout: str) -> bytes:
+    """Return the one file of a rosbag2 that holds its messages."""
+    [content] = [part for name, part in rosbag2(table, layout).items() if name != "metadata.yaml"]
+    return content
+
+
+def rosbag1(table, layout: str) -> bytes:
+    """Return a bag of ROS 1."""
+    library = pytest.importorskip("rosbags.rosbag1")
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    with tempfile.TemporaryDirectory() as folder:
+        writer = library.Writer(Path(folder) / "log.bag")
+        compression, joints = layout.split()
+        if compression != "plain":
+            writer.set_compression(library.Writer.CompressionFormat[compression.upper()])
+        with writer:
+            connection = writer.add_connection("/joint_states", JOINT, typestore=store)
+            for k, (stamp, state) in enumerate(states(table, joints)):
+                header = store.types["std_msgs/msg/Header"](k, state.header.stamp, "base")
+                fields = (header, state.name, state.position, state.velocity, state.effort)
+                writer.write(connection, stamp, store.serialize_ros1(store.types[JOINT](*fields), JOINT))
+        return (Path(folder) / "log.bag").read_bytes()
 
 
 def foxglove(table, layout: str) -> bytes:
@@ -193,6 +227,8 @@ CONTAINERS = {
     "mcap": Container(".mcap", bag, ("mcap one", "mcap two", "mcap odd", "zstd two"), CLOCKS, 1.1e-9),
     "foxglove": Container(".mcap", foxglove, ("lz4", "zstd", "plain"), CLOCKS, 1.1e-9),
     "db3": Container(".db3", bag, ("db3 one", "db3 two", "db3 odd"), CLOCKS, 1.1e-9),
+    "rosbag2": Container("", rosbag2, ("db3 two", "mcap two", "zstd odd"), CLOCKS, 1.1e-9),
+    "rosbag1": Container(".bag", rosbag1, ("plain two", "lz4 odd", "bz2 one"), CLOCKS, 1.1e-9),
     "lerobot": Container("", lerobot, ("v2.1", "v3.0"), (LEROBOT,)),
 }
 
