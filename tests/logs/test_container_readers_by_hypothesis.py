@@ -21,6 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxid.logs.log import read_log
+from jaxid.logs.readers.contents import contents_of
 from tests.support.random_logs import (
     FEW,
     MANY,
@@ -658,3 +659,32 @@ def test_a_database_with_other_contents(tmp_path, change, match):
         database.commit()
     assert outcome(tmp_path / "log.db3", ROS) is None
     refuse(tmp_path / "log.db3", ROS, match=match)
+
+
+@pytest.mark.parametrize(
+    ("unit", "stated"),
+    [
+        ("mm", "mm"),
+        (np.bytes_("mm"), "mm"),
+        (np.array([b"mm"]), "mm"),
+        (np.bytes_(b"\xb0"), "\ufffd"),
+        (b"\xff\xfe", "\ufffd\ufffd"),
+        (np.array([], dtype="f8"), None),
+        (5.0, None),
+    ],
+    ids=["text", "bytes", "array", "latin", "neither", "empty", "number"],
+)
+def test_units_of_any_kind(tmp_path, unit, stated):
+    """A unit that is no text is none, and one in another encoding can be printed."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values in steady_table().items():
+            file[name] = values
+        file["q"].attrs["units"] = unit
+    units = contents_of(tmp_path / "log.h5").units
+    assert units == ({} if stated is None else {"q": stated})
+    "".join(units.values()).encode()
+    log = outcome(tmp_path / "log.h5")
+    assert log is not None
+    scale = 1e-3 if stated == "mm" else 1.0
+    np.testing.assert_allclose(log.position[:, 0], scale * steady_table()["q"], rtol=1e-12)

@@ -141,7 +141,12 @@ def _unit_of(dataset: Any, name: str) -> dict[str, str]:
     """Return the unit among the attributes of a dataset, by name; empty if there is none."""
     for key in _UNITS:
         if key in dataset.attrs:
-            text = dataset.attrs[key]
-            text = text.decode() if isinstance(text, bytes) else text
-            return {name: str(np.ravel(text)[0])} if np.size(text) else {}
+            texts = [t for t in np.ravel(dataset.attrs[key]).tolist() if isinstance(t, str | bytes)]
+            return {name: _text(texts[0])} if texts else {}
     return {}
+
+
+def _text(value: str | bytes) -> str:
+    """Return a text of a file, with signs for what is no UTF-8, and could not be printed."""
+    raw = value if isinstance(value, bytes) else value.encode(errors="surrogateescape")
+    return raw.decode(errors="replace")
