@@ -10,8 +10,9 @@ from rosbags.rosbag2 import StoragePlugin
 
 import jaxid
 from jaxid.errors import InputError
-from tests.logs.test_formats import EPOCH, STORE, joint_state, write_bag
+from tests.logs.test_formats import EPOCH
 from tests.support.cli_setup import recorded, refused, run
+from tests.support.ros_bags import STORE, joint_state, write_bag
 from tests.support.written_logs import signals, write_csv
 from truth.arm.two_links import TwoLinks, run_sampled, unknown_reference
 from truth.axis.machines import emps_like

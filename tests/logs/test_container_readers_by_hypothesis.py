@@ -112,7 +112,7 @@ JOINTS = {"one": ["elbow"], "two": ["shoulder", "elbow"], "odd": ["a", "elbow", 
 
 def states(table, joints: str):
     """Yield recorded time [ns] and joint state of each row; joints beside the elbow have other numbers."""
-    written = pytest.importorskip("tests.logs.test_formats")
+    written = pytest.importorskip("tests.support.ros_bags")
     names = JOINTS[joints]
     at = names.index("elbow")
     for stamp, q, u in zip(stamps(table), table["q"], table["u"], strict=True):
@@ -125,7 +125,7 @@ def states(table, joints: str):
 def rosbag2(table, layout: str) -> dict[str, bytes]:
     """Return the files of a rosbag2, as the writer of rosbags makes it."""
     library = pytest.importorskip("rosbags.rosbag2")
-    written = pytest.importorskip("tests.logs.test_formats")
+    written = pytest.importorskip("tests.support.ros_bags")
     container, joints = layout.split()
     plugin = library.StoragePlugin.SQLITE3 if container == "db3" else library.StoragePlugin.MCAP
     with tempfile.TemporaryDirectory() as folder:
@@ -168,7 +168,7 @@ def foxglove(table, layout: str) -> bytes:
     """Return an MCAP of Foxglove's writer, with the message's definition as text."""
     mcap = pytest.importorskip("mcap.writer")
     mcap_ros2 = pytest.importorskip("mcap_ros2.writer")
-    written = pytest.importorskip("tests.logs.test_formats")
+    written = pytest.importorskip("tests.support.ros_bags")
     definition = written.STORE.generate_msgdef(JOINT, ros_version=2)[0]
     kind = {"lz4": mcap.CompressionType.LZ4, "zstd": mcap.CompressionType.ZSTD}
     buffer = io.BytesIO()
@@ -192,7 +192,7 @@ def foxglove(table, layout: str) -> bytes:
 def lerobot(table, layout: str) -> dict[str, bytes]:
     """Return the files of a dataset of one episode."""
     pytest.importorskip("pyarrow")
-    written = pytest.importorskip("tests.logs.test_formats")
+    written = pytest.importorskip("tests.support.lerobot_sets")
     both = {
         name: np.stack([values, values], axis=1).astype(np.float64)
         for name, values in (("state", table["q"]), ("action", table["u"]))

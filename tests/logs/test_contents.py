@@ -13,7 +13,8 @@ from scipy.io import savemat
 
 from jaxid.errors import InputError
 from jaxid.logs.readers.contents import contents_of
-from tests.logs.test_formats import T, joint_states, write_bag
+from tests.logs.test_formats import T, joint_states
+from tests.support.ros_bags import write_bag
 from tests.support.written_logs import signals, write_csv
 
 

@@ -1,7 +1,6 @@
 """Logs in the formats of other programs, each written by that ecosystem's writer."""
 
 import datetime
-import json
 import sqlite3
 import subprocess
 import sys
@@ -12,10 +11,8 @@ import nptdms
 import numpy as np
 import openpyxl
 import pandas
-import pyarrow
 import pytest
 import xarray
-from pyarrow import parquet
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -23,6 +20,8 @@ from rosbags.typesys import Stores, get_typestore
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import as_log
 from jaxid.logs.log import read_log
+from tests.support.lerobot_sets import lerobot
+from tests.support.ros_bags import STORE, joint_state, nanoseconds, write_bag
 from tests.support.written_logs import COLUMNS, refuse
 
 SAMPLES = 300
@@ -141,10 +140,7 @@ def test_tdms_with_waveforms_of_unequal_rate(tmp_path):
     assert "resample" in {a.setting for a in log.assumed}
 
 
-# LeRobot: the layouts of v2.1 and v3, after the datasets that lerobot publishes; its writer needs PyTorch.
-
-MOTORS = ["shoulder_pan.pos", "elbow_flex.pos"]
-
+# LeRobot
 
 EPISODES = [
     {"time": T, "state": np.stack([Q + k, 2 * Q], axis=1), "action": np.stack([U, 3 * U], axis=1)}
@@ -152,55 +148,12 @@ EPISODES = [
 ]
 
 
-def lerobot(root: Path, version: str, episodes=EPISODES, kind="float32") -> Path:
-    feature = {"dtype": kind, "shape": [2], "names": MOTORS}
-    named = {"motors": MOTORS} if version == "v2.1" else MOTORS
-    features = {name: {**feature, "names": named} for name in ("observation.state", "action")}
-    scalars = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name in scalars}
-    paths = {"v2.1": "episode_{episode_index:06d}", "v3.0": "file-{file_index:03d}"}
-    info = {
-        "codebase_version": version,
-        "robot_type": "so101_follower",
-        "total_episodes": len(episodes),
-        "fps": 500,
-        "data_path": f"data/chunk-{{chunk:03d}}/{paths[version]}.parquet",
-        "features": features,
-    }
-    (root / "meta").mkdir(parents=True)
-    (root / "meta" / "info.json").write_text(json.dumps(info))
-    tables = []
-    for k, episode in enumerate(episodes):
-        count = len(episode["time"])
-        tables.append(
-            pyarrow.table(
-                {
-                    "observation.state": list(episode["state"].astype(kind)),
-                    "action": list(episode["action"].astype(kind)),
-                    "timestamp": pyarrow.array(episode["time"].astype(kind)),
-                    "frame_index": np.arange(count),
-                    "episode_index": np.full(count, k),
-                    "index": np.arange(count) + sum(len(e["time"]) for e in episodes[:k]),
-                    "task_index": np.zeros(count, int),
-                }
-            )
-        )
-    folder = root / "data" / "chunk-000"
-    folder.mkdir(parents=True)
-    if version == "v2.1":
-        for k, table in enumerate(tables):
-            parquet.write_table(table, folder / f"episode_{k:06d}.parquet")
-    else:
-        parquet.write_table(pyarrow.concat_tables(tables), folder / "file-000.parquet")
-    return root
-
-
 LEROBOT = {"time": "timestamp", "position": "observation.state[elbow_flex.pos]", "force": "action[1]"}
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_lerobot(tmp_path, version):
-    root = lerobot(tmp_path / "set", version)
+    root = lerobot(tmp_path / "set", version, EPISODES)
     log = read_log(root, {**LEROBOT, "episode": 1})
     assert log.samples == SAMPLES
     # Numbers of the dataset are float32.
@@ -215,7 +168,7 @@ def test_lerobot(tmp_path, version):
 
 
 def test_a_file_of_a_lerobot_dataset_is_its_episode(tmp_path):
-    path = lerobot(tmp_path / "set", "v2.1") / "data" / "chunk-000" / "episode_000001.parquet"
+    path = lerobot(tmp_path / "set", "v2.1", EPISODES) / "data" / "chunk-000" / "episode_000001.parquet"
     log = read_log(path, {**LEROBOT, "position": "observation.state[shoulder_pan.pos]"})
     np.testing.assert_allclose(log.position[:, 0], Q + 1, atol=3e-7)
     assert log.assumed[0].value == 1
@@ -224,41 +177,12 @@ def test_a_file_of_a_lerobot_dataset_is_its_episode(tmp_path):
 # ROS
 
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
 EPOCH = 1_700_000_000.0
 ROS = {
     "time": "header.stamp",
     "position": "/joint_states.position[elbow]",
     "force": "/joint_states.effort[elbow]",
 }
-
-
-def nanoseconds(t: float) -> int:
-    return round(t * 1e9)
-
-
-def joint_state(store, t, names, position, effort=()):
-    kinds = store.types
-    stamp = kinds["builtin_interfaces/msg/Time"](nanoseconds(t) // 10**9, nanoseconds(t) % 10**9)
-    return kinds["sensor_msgs/msg/JointState"](
-        kinds["std_msgs/msg/Header"](stamp, "base"),
-        list(names),
-        np.array(position, dtype=np.float64),
-        np.zeros(0),
-        np.array(effort, dtype=np.float64),
-    )
-
-
-def write_bag(path, plugin, messages, version=8):
-    """Write (topic, type, recorded, message) with the rosbag2 writer."""
-    with Writer(path, version=version, storage_plugin=plugin) as writer:
-        connections = {}
-        for topic, kind, recorded, message in messages:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            raw = STORE.serialize_cdr(message, kind)
-            writer.write(connections[topic], nanoseconds(recorded), raw)
-    return path
 
 
 def joint_states(names=("shoulder", "elbow"), skew=lambda k: 0.0):
