@@ -22,6 +22,7 @@ from jaxid.estimators.effort import SCALE, Scale, scale_by_effort
 from jaxid.estimators.estimate import Estimate, misfit
 from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
+from jaxid.estimators.servo_rate import leaves_rate_open, with_rate_of_log
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
 from jaxid.estimators.ticks import starts_beside, with_std_of_ticks
@@ -50,8 +51,8 @@ def unforced_steps(
     """Fit the positions of loops whose force was not logged, from several starts, to one log or to several.
 
     An arm of servos starts from fits of each joint alone, see `jaxid.estimators.apart`. If the case states
-    the period of the loop, no delay has a smaller standard deviation than that of a uniform error of one
-    period.
+    the period of the loop, or if it is chosen (see `jaxid.estimators.servo_rate`), no delay has a smaller
+    standard deviation than that of a uniform error of one period.
 
     Args:
         session: Case and logs of the fit.
@@ -59,7 +60,14 @@ def unforced_steps(
         scaled: Whether an effort of known gain gives the scale, if nothing else does.
         options: Further arguments of `output_error_steps`.
     """
-    result = yield from _fitted_steps(session, numerics, scaled, **options)
+
+    def fitted(session: Session) -> Steps[Estimate]:
+        return (yield from _fitted_steps(session, numerics, scaled, **options))
+
+    own_rate = numerics is None and leaves_rate_open(session)
+    if own_rate and not stands_apart(session.machine, parts_of(session)):
+        return with_std_of_ticks((yield from with_rate_of_log(session, fitted)))
+    result = yield from fitted(session)
     controller = session.case.controller
     stated = controller is not None and controller.period is not None
     return with_std_of_ticks(result) if stated else result

@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from jaxid.case.case import Case
-from jaxid.consistency.absent import check_absent
+from jaxid.consistency.absent import SLOW_LOOP, check_absent
 from jaxid.logs.log import Log
 from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine
-
-# Period of a log from which on it is probably not that of the servo's own loop [s].
-_SLOW_LOOP = 2.5e-3
 
 
 def log_findings(case: Case, log: Log, machine: Machine, short: bool, *, alone: bool = True) -> list[Finding]:
@@ -46,7 +43,7 @@ def log_findings(case: Case, log: Log, machine: Machine, short: bool, *, alone: 
         free=True,
     )
     check_absent(case, machine, log, alone=alone)
-    if machine.unforced(log) and case.controller is not None and log.period > _SLOW_LOOP:
+    if machine.unforced(log) and case.controller is not None and log.period > SLOW_LOOP:
         findings += [] if case.controller.period else [_assumed_period(case, log)]
 
     impossible = plant.impossible(log.position) if all(log.measured) else None
@@ -65,10 +62,11 @@ def log_findings(case: Case, log: Log, machine: Machine, short: bool, *, alone: 
 
 
 def _assumed_period(case: Case, log: Log) -> Finding:
-    """Return the warning that a slow log's period is taken for that of the servo's loop."""
+    """Return the warning that a slow log's period may be taken for that of the servo's loop."""
     return Finding(
         "warning",
-        f"the period of the servo's loop is not stated: that of the log, {1e3 * log.period:.3g} ms, is taken",
+        f"the period of the servo's loop is not stated: that of the log, {1e3 * log.period:.3g} ms, is "
+        "taken, unless identify finds another one in the log of one servo",
         f"{case.where}, [controller]",
         "state period: most servos run their loop at 200 Hz to some kHz, and gains depend on it",
     )

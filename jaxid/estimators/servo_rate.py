@@ -1,0 +1,138 @@
+"""Choice of the rate of a servo's loop, and of its command between two rows, for a log without a force.
+
+A host sends commands slowly to a servo whose loop is fast. A loop that is simulated at the rate of the log
+differentiates over ten times as long, and takes other gains and another delay for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxid.consistency.absent import SLOW_LOOP
+from jaxid.consistency.hold import clearly_smaller
+from jaxid.estimators.estimate import Estimate, misfit
+from jaxid.numerics.lanes import Steps
+
+if TYPE_CHECKING:
+    from jaxid.session import Session
+
+# Ticks of the loop in a row of the log that are tried first, and then beside more than one.
+_FIRST, _MORE = (1, 10), (5, 4, 2, 20)
+# Courses of the command between two rows that are tried.
+_COURSES = ("zero_order", "band_limited")
+# Most ticks a second.
+_FASTEST = 4000.0
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """A loop and its fit.
+
+    Args:
+        ticks: Ticks in a row of the log.
+        course: Course of the command between two rows.
+        estimate: The fit.
+    """
+
+    ticks: int
+    course: str
+    estimate: Estimate
+
+    def words(self, period: float) -> str:
+        """Return the loop in words, for a log of some period [s]."""
+        size = f"{1e3 * period / self.ticks:.3g} ms"
+        return size if self.ticks == 1 else f"{size} with {self.course} commands"
+
+
+def leaves_rate_open(session: Session) -> bool:
+    """Check that a case does not state the period of a servo's loop, and that the log is slower than most."""
+    controller, log = session.case.controller, session.fit.log
+    unstated = controller is not None and controller.period is None
+    return unstated and not session.more and log.period > SLOW_LOOP
+
+
+def with_rate_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate]]) -> Steps[Estimate]:
+    """Fit loops of several rates, and return the fit that explains the log.
+
+    Args:
+        session: Case and log; the case `leaves_rate_open`.
+        fitted: Function that fits a session.
+
+    Returns:
+        The fit that is clearly the best. If others explain the log about as well, the standard deviations are
+        widened so that the 95 % intervals hold their values.
+    """
+    stated = "reference_hold" in session.case.tables.get("log", {})
+    courses = (session.machine.reference_hold,) if stated else _COURSES
+    period = session.fit.log.period
+    loops: list[_Loop] = []
+
+    def tried(ticks: int, course: str) -> Steps[None]:
+        if ticks > 1 and ticks / period > _FASTEST:
+            return
+        estimate = yield from fitted(_at(session, ticks, course))
+        if estimate.converged:
+            loops.append(_Loop(ticks, course, estimate))
+
+    for ticks in _FIRST:
+        for course in courses if ticks > 1 else courses[:1]:
+            yield from tried(ticks, course)
+    best = _best(loops)
+    if best is not None and best.ticks > 1:
+        for ticks in _MORE:
+            yield from tried(ticks, best.course)
+        best = _best(loops)
+    if best is None:
+        return (yield from fitted(session))
+
+    equal = [loop for loop in loops if loop is not best and not _clearly_better(best, loop)]
+    return _said(best, equal, loops, period)
+
+
+def _at(session: Session, ticks: int, course: str) -> Session:
+    """Return a session whose loop has some ticks in a row of the log."""
+    machine = session.machine
+    assert machine.controller is not None, "asked of a servo"
+    controller = replace(machine.controller, period=session.fit.log.period / ticks)
+    return session.with_machine(replace(machine, controller=controller, reference_hold=course))
+
+
+def _best(loops: list[_Loop]) -> _Loop | None:
+    return min(loops, key=lambda loop: misfit(loop.estimate), default=None)
+
+
+def _clearly_better(best: _Loop, other: _Loop) -> bool:
+    """Check that a loop leaves clearly less of the log than another one."""
+    left, more = best.estimate.residual, other.estimate.residual
+    counts = np.isfinite(left) & np.isfinite(more)
+    scale = max(float(np.sqrt(np.mean(np.square(left[counts])))), 1e-300)
+    return clearly_smaller(np.where(counts, left, 0.0) / scale, np.where(counts, more, 0.0) / scale, counts)
+
+
+def _said(best: _Loop, equal: list[_Loop], loops: list[_Loop], period: float) -> Estimate:
+    """Return the best fit with the choice among its settings and notes."""
+    estimate = best.estimate.holding(*(loop.estimate.theta for loop in equal))
+    sizes = "; ".join(
+        f"{loop.words(period)} {np.sqrt(np.nanmean(np.square(loop.estimate.residual))):.3g}"
+        for loop in sorted(loops, key=lambda loop: misfit(loop.estimate))
+    )
+    reason = f"RMS that the fitted loops leave: {sizes}"
+    if equal:
+        named = ", ".join(loop.words(period) for loop in (best, *equal))
+        reason = f"{named} explain the log about equally well, and the 95 % intervals hold the values of all"
+    settings = {"period": {"value": f"{period / best.ticks:.6g} s", "reason": reason}}
+    if best.ticks > 1:
+        settings["reference_hold"] = {"value": best.course, "reason": reason}
+    note = f"the period of the servo's loop is not stated: {best.words(period)} is taken; {reason}"
+    return replace(
+        estimate,
+        notes=(*estimate.notes, note),
+        details={
+            **estimate.details,
+            "settings": {**estimate.details.get("settings", {}), **settings},
+        },
+    )

@@ -1,0 +1,113 @@
+"""The rate of a servo's loop and its commands between two rows, which a case leaves open."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+import jaxid
+from benchmarks.unforced_machines import servo
+from jaxid.estimators import servo_rate
+from jaxid.session import open_session
+
+
+def open_case(seed: int) -> tuple[dict, dict, object]:
+    """A drawn servo, whose case states neither the period of its loop nor the course of its command."""
+    drawn = servo(seed)
+    case = drawn.case()
+    del case["controller"]["period"], case["log"]["reference_hold"]
+    return case, drawn.columns(), drawn
+
+
+def fits(left: dict, tried: list, theta=lambda loop: 1.0):
+    """A fit whose residual has a size by loop, and the loops that were fitted."""
+
+    def fitted(session):
+        machine = session.machine
+        loop = (round(session.fit.log.period / machine.controller.period), machine.reference_hold)
+        tried.append(loop)
+        rng = np.random.default_rng(len(tried))
+        estimate = FakeFit(np.array([theta(loop)]), left.get(loop, 5.0) * rng.standard_normal((600, 1)))
+        return estimate
+        yield
+
+    return fitted
+
+
+@dataclass(frozen=True)
+class FakeFit:
+    """What the choice takes of an estimate."""
+
+    theta: np.ndarray
+    residual: np.ndarray
+    held: tuple[float, ...] = ()
+    notes: tuple[str, ...] = ()
+    details: dict = field(default_factory=dict)
+    converged: bool = True
+
+    def holding(self, *others):
+        return replace(self, held=tuple(float(other[0]) for other in others))
+
+
+@pytest.fixture
+def chosen(monkeypatch):
+    """The choice among fits whose residuals have given sizes."""
+    case, log, _ = open_case(1)
+    session = open_session(case, log)
+    assert servo_rate.leaves_rate_open(session)
+    monkeypatch.setattr(servo_rate, "misfit", lambda e: float(np.sum(e.residual**2)))
+
+    def choose(left, theta=lambda loop: 1.0):
+        tried: list = []
+        steps = servo_rate.with_rate_of_log(session, fits(left, tried, theta))
+        with pytest.raises(StopIteration) as end:
+            next(steps)
+        return end.value.value, tried
+
+    return choose
+
+
+def test_the_loop_that_leaves_clearly_least_is_taken(chosen):
+    found, tried = chosen({(4, "zero_order"): 1.0, (10, "zero_order"): 2.0})
+    assert found.details["settings"]["period"]["value"] == "0.005 s"
+    assert found.details["settings"]["reference_hold"]["value"] == "zero_order"
+    assert found.held == ()
+    assert len(tried) == len(set(tried)) == 7
+
+
+def test_loops_that_leave_as_little_widen_the_intervals(chosen):
+    found, _ = chosen(
+        {(4, "zero_order"): 1.0, (10, "zero_order"): 1.01, (20, "zero_order"): 2.0},
+        theta=lambda loop: loop[0],
+    )
+    assert found.held == (10.0,) or found.held == (4.0,)
+    assert "about equally well" in found.notes[-1]
+
+
+def test_a_log_that_holds_every_tick_needs_no_faster_loop(chosen):
+    found, tried = chosen({(1, "zero_order"): 1.0, (1, "band_limited"): 1.0})
+    assert found.details["settings"]["period"]["value"] == "0.02 s"
+    assert "reference_hold" not in found.details["settings"]
+    assert {ticks for ticks, _ in tried} == {1, 10}
+
+
+def test_a_stated_period_is_kept():
+    drawn = servo(1)
+    assert not servo_rate.leaves_rate_open(open_session(drawn.case(), drawn.columns()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 3, 6])
+def test_the_rate_of_a_servo_is_found(seed):
+    """At the rate of the log, inertias were 42 % off, and delays 40 standard deviations."""
+    case, log, drawn = open_case(seed)
+    result = jaxid.identify(case, log)
+    estimate, truth = result.estimate, drawn.truth()
+    period = float(estimate.details["settings"]["period"]["value"].split()[0])
+    assert period <= 1.01 / drawn.rate
+    assert estimate.details["settings"]["reference_hold"]["value"] == "zero_order"
+    assert result.model_complete
+    known = [k for k, ok in enumerate(estimate.identifiable) if ok]
+    assert known
+    for k in known:
+        assert abs(estimate.theta[k] - truth[estimate.names[k]]) < 4 * estimate.std[k]
