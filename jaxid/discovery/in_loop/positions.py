@@ -39,6 +39,8 @@ _SPRUNG, _TURN = 4, 0.25
 _RENEWALS = 2
 # Delays beside that of a fit from which it is tried again, in rows of the log.
 _DELAYS = (-1.0, -0.5, -0.25, 0.25, 0.5, 1.0)
+# RMS of a shift of the mean readings, in standard deviations of a reading, from which a loop is unstable.
+_SHAKEN = 3.0
 # Squared residual, relative to the noise's, beyond which candidates are fitted from afar too.
 _FAR = 1.5
 # Part of the motion that integration leaves wrong in any model.
@@ -134,13 +136,17 @@ class LoopSamples:
     ) -> LoopSamples:
         """Return the samples with the noise of the encoder as it is beside a model.
 
+        The loop of an incomplete model may be unstable, so that noise moves it far. Its mean readings say
+        nothing of other models, whose loops then have none.
+
         Args:
             superset: The machine with all candidates.
             added: Effects of the model.
             theta: All unknowns of the superset.
         """
         machine, replay = self._alone(superset, added, theta)
-        return self.with_noise(estimated_noise(machine, self.log, replay, follows=False))
+        noise = estimated_noise(machine, self.log, replay, follows=False)
+        return replace(self, noise=None) if noise is not None and _shaken(noise) else self.with_noise(noise)
 
     def drawn_noise(
         self, superset: cand.CandidateModel, added: Sequence[cand.Candidate], theta: np.ndarray, runs: int
@@ -283,6 +289,14 @@ class PositionDomain:
         alone = replace(self.superset.machine.plant, effects=(effect,))
         still = np.zeros((1, len(self.superset.machine.gain)))
         return float(fastest_rate(alone, samples.parts[0].measured[:1], still)) * self.step < _TURN
+
+
+def _shaken(noise: ReadingNoise) -> bool:
+    """Check that noise of an encoder moves the mean readings of a loop by far more than its size."""
+    if noise.shift is None:
+        return False
+    size = np.hypot(noise.std, noise.count / np.sqrt(12))
+    return bool(np.any(np.sqrt(np.mean(np.square(noise.shift), axis=0)) > _SHAKEN * size))
 
 
 @dataclass
