@@ -81,6 +81,9 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
         declared = replace(declared, counts=data.fitted)
 
     hold, better, settings = None, better_hold(machine, log, data, declared), {}
+    if clipped is not None:
+        rows = f"{int(clipped[0].any(axis=1).sum())} rows"
+        settings["clipped_force"] = {"value": rows, "reason": clipped[1].what}
     if better is not None:
         findings.append(hold_finding(log, *better, machine.unit("force"), used=free_hold))
         if free_hold:
@@ -105,8 +108,8 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
     made = replayed.command if replayed is not None and replayed.exact else None
     noise = estimated_force_noise(machine, log, data, declared, made)
     findings += noise_findings(machine, log, data, declared, noise)
-    rows = None if clipped is None else clipped[0]
-    return AgainstCase(findings, hold, machine.reference_hold, noise, settings, rows)
+    left_out = None if clipped is None else clipped[0]
+    return AgainstCase(findings, hold, machine.reference_hold, noise, settings, left_out)
 
 
 def _with_reference_hold(

@@ -42,6 +42,7 @@ def test_clipped_rows_are_left_out():
     share = f"{rows.sum()} rows ({100 * rows.mean():.2g} %)"
     assert found.findings[0] == f"{SEEMS.capitalize()} in {share}, which are left out."
     assert "record the force with a larger range" in said(found.session)[0]
+    assert found.session.settings["clipped_force"]["value"] == f"{rows.sum()} rows"
 
 
 def test_a_method_that_takes_every_row_says_so():
