@@ -119,8 +119,10 @@ def _nulls(runs: Sequence[Record]) -> Iterator[str]:
 
 def _pace(runs: Sequence[Record]) -> Iterator[str]:
     seconds = [r["search_seconds"] for r in runs if "search_seconds" in r]
+    hidden = [r["search_seconds"] for r in runs if "search_seconds" in r and r["hidden"]]
     if seconds:
         busy = [r["search_cpu_seconds"] for r in runs if "search_cpu_seconds" in r]
         of_cores = f"; {np.median(busy):.0f} s of a core's time (median of {len(busy)})" if busy else ""
         clock = f"{np.median(seconds):.0f} s (median), {np.max(seconds):.0f} s at most"
+        clock += f", {np.median(hidden):.0f} s where an effect is hidden (median)" if hidden else ""
         yield f"A search takes {clock}{of_cores}."
