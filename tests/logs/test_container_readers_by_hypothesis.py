@@ -82,7 +82,8 @@ def xlsx(table, layout: str) -> bytes:
         sheet.append(row)
     sheet.append(list(table))
     for row in zip(*table.values(), strict=True):
-        sheet.append([float(x) for x in row])
+        # No cell holds infinity or NaN: Excel has an error there, and openpyxl would leave the cell empty.
+        sheet.append([float(x) if np.isfinite(x) else "#NUM!" for x in row])
     buffer = io.BytesIO()
     book.save(buffer)
     return buffer.getvalue()
