@@ -13,7 +13,7 @@ from jaxid.machine import Machine
 from jaxid.numerics.precision import Precision
 
 # Half width of a 95 % interval in standard deviations.
-_INTERVAL = 1.96
+INTERVAL = 1.96
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Estimate:
             return self
         away = np.max([np.abs(theta - self.theta) for theta in others], axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            wider = 1 + away / (_INTERVAL * self.std)
+            wider = 1 + away / (INTERVAL * self.std)
         return self.wider(np.where(np.isfinite(wider), wider, 1.0))
 
     def wider(self, factor: Float[np.ndarray, " p"]) -> Estimate:

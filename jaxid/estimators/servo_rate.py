@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxid.consistency.absent import SLOW_LOOP
 from jaxid.consistency.hold import clearly_smaller
-from jaxid.estimators.estimate import Estimate, misfit
+from jaxid.estimators.estimate import INTERVAL, Estimate, misfit
 from jaxid.numerics.lanes import Steps
 
 if TYPE_CHECKING:
@@ -133,6 +133,20 @@ def _said(best: _Loop, equal: list[_Loop], loops: list[_Loop], period: float) ->
         notes=(*estimate.notes, note),
         details={
             **estimate.details,
+            **_relative_holding(best, equal),
             "settings": {**estimate.details.get("settings", {}), **settings},
         },
     )
+
+
+def _relative_holding(best: _Loop, equal: list[_Loop]) -> dict[str, Any]:
+    """Return the detail `relative` of the best fit with 95 % intervals that hold the values of others."""
+    given = [loop.estimate.details.get("relative") for loop in (best, *equal)]
+    if given[0] is None:
+        return {}
+    values = {}
+    for name, entry in given[0]["values"].items():
+        others = [of["values"][name]["value"] for of in given[1:] if of is not None and name in of["values"]]
+        away = max((abs(other - entry["value"]) for other in others), default=0.0)
+        values[name] = entry if not entry["std"] else {**entry, "std": entry["std"] + away / INTERVAL}
+    return {"relative": {**given[0], "values": values}}

@@ -84,6 +84,23 @@ def test_loops_that_leave_as_little_widen_the_intervals(chosen):
     assert "about equally well" in found.notes[-1]
 
 
+def test_ratios_to_a_base_are_widened_too():
+    def loop(value, std):
+        values = {"controller.kp": {"value": value, "std": std, "unit": "1"}}
+        fit = FakeFit(
+            np.zeros(1), np.zeros((1, 1)), details={"relative": {"to": "inertia", "values": values}}
+        )
+        return servo_rate._Loop(1, "zero_order", fit)
+
+    best, other = loop(300.0, 1.0), loop(300.0 + 1.96 * 2.0, 1.0)
+    assert servo_rate._relative_holding(best, [])["relative"]["values"]["controller.kp"]["std"] == 1.0
+    held = servo_rate._relative_holding(best, [other])["relative"]
+    assert held["to"] == "inertia"
+    assert held["values"]["controller.kp"]["std"] == pytest.approx(3.0)
+    plain = servo_rate._Loop(1, "zero_order", FakeFit(np.zeros(1), np.zeros((1, 1))))
+    assert servo_rate._relative_holding(plain, [other]) == {}
+
+
 def test_a_log_that_holds_every_tick_needs_no_faster_loop(chosen):
     found, tried = chosen({(1, "zero_order"): 1.0, (1, "band_limited"): 1.0})
     assert found.details["settings"]["period"]["value"] == "0.02 s"
