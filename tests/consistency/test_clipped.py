@@ -8,7 +8,7 @@ import pytest
 
 import jaxid
 from benchmarks.interval_machines import MACHINES
-from jaxid.consistency.clipped import SEEMS
+from jaxid.consistency.clipped import SEEMS, at_extremes
 from jaxid.session import open_session
 from truth.axis.hidden_effects import SEARCH_CASES
 
@@ -88,15 +88,20 @@ def test_a_coarse_force_is_not_clipped():
     assert not said(open_session(case, log, method="inverse_dynamics"))
 
 
-@pytest.mark.parametrize("kind", list(SEARCH_CASES))
+# A hidden saturation holds the loop at its limit for most of the log.
+LIMITED = [kind for kind in SEARCH_CASES if kind != "saturation"]
+
+
+@pytest.mark.parametrize("kind", LIMITED)
 def test_a_drive_that_reaches_its_limit_is_not_clipped(kind):
-    """The case lacks an effect of the machine."""
+    """The case lacks an effect of the machine; the force is logged without noise, so that it has plateaus."""
     row = replace(SEARCH_CASES[kind], duration=4.0)
     setup = row.setup(1)
+    setup = replace(setup, sensor=replace(setup.sensor, force_noise=0.0))
     most = np.abs(setup.run()["force"]).max()
-    setup = replace(setup, loop=replace(setup.loop, limit=0.8 * most))
-    run = setup.run()
-    assert np.mean(np.abs(run["force"]) >= 0.8 * most * (1 - 1e-9)) > 0.001
+    run = replace(setup, loop=replace(setup.loop, limit=0.9 * most)).run()
+    stands = at_extremes(np.reshape(run["force"], (-1, 1))).any(axis=0)
+    assert 0.001 < stands.mean() < 0.25
     case = tomllib.loads(row.text())
     case = {name: case[name] for name in ("plant", "effects", "actuator") if name in case}
     case["log"] = {"time": "t", "position": "q", "force": "u"}
