@@ -13,12 +13,11 @@ from jaxid.case.case import Case, CaseLike
 from jaxid.case.user_faults import named_faults
 from jaxid.commands.robot_case import implied_case
 from jaxid.consistency.absent import acts_by_position
-from jaxid.consistency.late_force import LateForce, late_force
-from jaxid.consistency.slow_force import SlowForce, slow_force
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.naming import Found, named_at_rest
 from jaxid.discovery.by_sensors import add_by_sensors
 from jaxid.discovery.final import final_machine, machine_with
+from jaxid.discovery.force_readings import force_reading, keeps_time
 from jaxid.discovery.in_loop.by_joint import explore_by_joint
 from jaxid.discovery.in_loop.confirm import WHY, hindering
 from jaxid.discovery.in_loop.search import explore_within
@@ -46,13 +45,10 @@ from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.model.effect import Effect
-from jaxid.names import HOLDS
 from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.numerics.lanes import Steps, begin, run_alone
 from jaxid.session import Logs, OpenedLog, Session, open_session
 from jaxid.session.holds import session_under_better_hold
-from jaxid.session.preparing import under_hold
 from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.solvers import SOLVERS
 
@@ -192,8 +188,7 @@ def _explore_forces(
     where = where_of(search, steps[0], session)
     final, effects = _simulable(session, search, baseline.machine, steps, most, progress)
     verdict = "found" if effects else _verdict_on_none(where, steps, search, session, baseline.machine)
-    reading = _late_force(session, search, baseline.machine)
-    reading = reading or _slow_force(session, search, baseline.machine)
+    reading = force_reading(session, search, baseline.machine)
 
     progress("refitting in simulation" if refit else "simulating")
     before = after = declared.result()
@@ -244,61 +239,13 @@ def _under_better_hold(session: Session, search: Search, machine: Machine) -> Se
     model = search.model
     if not model.added:
         return None
-    added = [c for c in model.added if _keeps_time(cand.effect_of(search.superset, c))]
+    added = [c for c in model.added if keeps_time(cand.effect_of(search.superset, c))]
     found, _ = machine_with(machine, search.superset, added, model.theta)
     if len(added) == len(model.added):
         return session_under_better_hold(session, found)
     whole, _ = machine_with(machine, search.superset, model.added, model.theta)
     rival = force_gap(session.fit.machine(whole), session.fit.data).rms
     return session_under_better_hold(session, found, rival)
-
-
-def _late_force(session: Session, search: Search, machine: Machine) -> LateForce | None:
-    """Return the late force that explains the log as well as the effects that were found; None if none does.
-
-    Those that shift the force in time are held against it first, then all.
-    """
-    model = search.model
-    if not model.added or session.more:
-        return None
-    whole, _ = machine_with(machine, search.superset, model.added, model.theta)
-    data, held = session.fit.data, None
-    if "hold" in session.settings:
-        held = under_hold(HOLDS[0], session.fit, session.machine).data
-    kept = [c for c in model.added if _keeps_time(cand.effect_of(search.superset, c))]
-    for beside in (kept, []) if kept else ([],):
-        if len(beside) == len(model.added):
-            continue
-        without, _ = machine_with(machine, search.superset, beside, model.theta)
-        named = [c.label for c in model.added if all(c is not b for b in beside)]
-        late = late_force(without, whole, data, named, held)
-        if late is not None:
-            return late
-    return None
-
-
-def _slow_force(session: Session, search: Search, machine: Machine) -> SlowForce | None:
-    """Return the slow course of the force that explains the log better than effects that were found.
-
-    All effects are held against it first, then all but one; None if it explains the log better than none.
-    """
-    model = search.model
-    if not model.added or session.more:
-        return None
-    whole, _ = machine_with(machine, search.superset, model.added, model.theta)
-    added = list(model.added)
-    for beside in ([], *([c] for c in added if len(added) > 1)):
-        without, _ = machine_with(machine, search.superset, beside, model.theta)
-        named = [c for c in added if all(c is not b for b in beside)]
-        unknowns = sum(len(c.index) for c in named)
-        slow = slow_force(without, whole, session.fit.data, [c.label for c in named], unknowns)
-        if slow is not None:
-            return slow
-    return None
-
-
-def _keeps_time(effect: Effect) -> bool:
-    return effect.adds_force and not effect.adds_spring and not effect.delays_command()
 
 
 def _simulable(

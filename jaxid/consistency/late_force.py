@@ -14,6 +14,7 @@ import scipy.optimize
 from jaxtyping import Bool, Float
 
 from jaxid.consistency.balance_fit import BalanceFit, balance_fits
+from jaxid.consistency.force_reading import ForceReading
 from jaxid.consistency.late_model import LateModel, least_near
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -35,25 +36,18 @@ _DECAYED = 6.0
 _MOST = 8000
 
 
-@dataclass(frozen=True)
-class LateForce:
+@dataclass(frozen=True, kw_only=True)
+class LateForce(ForceReading):
     """A late force that explains a log as well as effects do.
 
     Args:
+        gap, rival, effects, unit: See `ForceReading`.
         delay: Time by which the force is logged after it acted [s].
         lag: Time constant of the first-order low-pass that it passed on the way, zero if none [s].
-        gap: Force gap of each driven joint if the force is late, without the effects [N or N m].
-        rival: Force gap with the effects, and the force as logged.
-        effects: Names of the effects.
-        unit: Unit of the gaps.
     """
 
     delay: float
     lag: float
-    gap: Float[np.ndarray, " driven"]
-    rival: Float[np.ndarray, " driven"]
-    effects: tuple[str, ...]
-    unit: str
 
     key = "late_force"
     short = "late force"
@@ -75,23 +69,13 @@ class LateForce:
 
     def json(self) -> dict[str, object]:
         """Return the object `late_force` of discovery.json."""
-        return {
-            "delay": self.delay,
-            "lag": self.lag,
-            "gap": self.gap.tolist(),
-            "gap_with_effects": self.rival.tolist(),
-            "effects": list(self.effects),
-        }
+        return {"delay": self.delay, "lag": self.lag, **super().json()}
 
     @property
     def findings(self) -> list[str]:
         """Sentences on it and on what to do."""
-        named = " and ".join(self.effects)
-        worst = int(np.argmax(self.rival))
-        sizes = f"{self.gap[worst]:.3g} {self.unit}, with {named} {self.rival[worst]:.3g} {self.unit}"
         return [
-            f"The force seems to be logged {self.how}: that explains the log as well as {named} "
-            f"{'does' if len(self.effects) == 1 else 'do'} (it leaves a force gap of {sizes}).",
+            f"The force seems to be logged {self.how}: that {self.beside_effects('as well as')}.",
             f"If the drive logs its force so, set {self.keys} in [log], which takes it back, and search "
             "again.",
         ]
@@ -135,7 +119,9 @@ def late_force(
     explains = before**2 - gap**2 >= _EXPLAINS * (before**2 - rival**2)
     if not np.all(explains & (gap <= _AS_MUCH * rival) & (gap <= _CLEARLY * before)):
         return None
-    return LateForce(delay, lag, gap, rival, tuple(effects), machine.unit("force"))
+    return LateForce(
+        gap=gap, rival=rival, effects=tuple(effects), unit=machine.unit("force"), delay=delay, lag=lag
+    )
 
 
 def _longest(data: Prepared) -> Prepared:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.consistency.balance_fit import BalanceFit, balance_fits
+from jaxid.consistency.force_reading import ForceReading
 from jaxid.consistency.late_force import plain
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -25,50 +26,33 @@ _CLEARLY = 5.0
 _LESS = 0.9
 
 
-@dataclass(frozen=True)
-class SlowForce:
-    """A slow course of the force that explains a log better than effects do.
+@dataclass(frozen=True, kw_only=True)
+class SlowForce(ForceReading):
+    """A slow course of the force, a polynomial of time, that explains a log better than effects do.
 
     Args:
-        gap: Force gap of each driven joint under a polynomial of time, without the effects [N or N m].
-        rival: Force gap with the effects.
+        gap, rival, effects, unit: See `ForceReading`.
         degree: Degree of the polynomial.
         evidence: Log-likelihood beyond that of the effects, half the logarithm of the number of samples
             subtracted for each unknown [nats].
-        effects: Names of the effects.
-        unit: Unit of the gaps.
     """
 
-    gap: Float[np.ndarray, " driven"]
-    rival: Float[np.ndarray, " driven"]
     degree: int
     evidence: float
-    effects: tuple[str, ...]
-    unit: str
 
     key = "slow_force"
     short = "drift of the force"
 
     def json(self) -> dict[str, object]:
         """Return the object `slow_force` of discovery.json."""
-        return {
-            "degree": self.degree,
-            "gap": self.gap.tolist(),
-            "gap_with_effects": self.rival.tolist(),
-            "evidence": self.evidence,
-            "effects": list(self.effects),
-        }
+        return {"degree": self.degree, "evidence": self.evidence, **super().json()}
 
     @property
     def findings(self) -> list[str]:
         """Sentences on it and on what to do."""
-        named = " and ".join(self.effects)
-        worst = int(np.argmax(self.rival))
-        sizes = f"{self.gap[worst]:.3g} {self.unit}, with {named} {self.rival[worst]:.3g} {self.unit}"
         return [
             "The force seems to drift: a slow course of time (a polynomial of degree "
-            f"{self.degree}) explains the log better than {named} "
-            f"{'does' if len(self.effects) == 1 else 'do'} (it leaves a force gap of {sizes}).",
+            f"{self.degree}) {self.beside_effects('better than')}.",
             "Log the force at rest before and after the motion, subtract the zero of the sensor, and search "
             "again; a longer log with more motions tells both apart.",
         ]
@@ -119,7 +103,14 @@ def slow_force(
     by_course, gap, degree = best
     if not np.any(gap <= _LESS * before):
         return None
-    return SlowForce(gap, rival, degree, by_course - by_effects, tuple(effects), machine.unit("force"))
+    return SlowForce(
+        gap=gap,
+        rival=rival,
+        effects=tuple(effects),
+        unit=machine.unit("force"),
+        degree=degree,
+        evidence=float(by_course - by_effects),
+    )
 
 
 def _courses(

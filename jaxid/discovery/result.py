@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxid.consistency.late_force import LateForce
-from jaxid.consistency.slow_force import SlowForce
+from jaxid.consistency.force_reading import ForceReading
 from jaxid.discovery.score import Score
 from jaxid.discovery.where import Where
 from jaxid.estimators.estimate import Estimate
@@ -97,7 +96,7 @@ class Discovery(FitResult):
     noise_floor: np.ndarray
     proposals: tuple[Proposal, ...] = ()
     unseen: str = ""
-    force_reading: LateForce | SlowForce | None = None
+    force_reading: ForceReading | None = None
     joints: Mapping[int, Discovery] = field(default_factory=dict)
 
     @property

@@ -295,7 +295,14 @@ def test_a_part_that_exceeds_the_whole_is_not_complete(tmp_path, load, std, impo
 
 
 def test_no_model_with_a_late_force_is_complete(complete):
-    late = LateForce(0.002, 0.0, np.array([1.0]), np.array([1.01]), ("joint_flexibility",), "N")
+    late = LateForce(
+        gap=np.array([1.0]),
+        rival=np.array([1.01]),
+        effects=("joint_flexibility",),
+        unit="N",
+        delay=0.002,
+        lag=0.0,
+    )
     found = judge(complete.session, complete.estimate, complete.gaps, "found", late)
     assert found.model_complete is None
     assert found.findings[0].startswith(

@@ -9,9 +9,8 @@ import numpy as np
 
 from jaxid.consistency.absent import known_forces
 from jaxid.consistency.clipped import SEEMS
-from jaxid.consistency.late_force import LateForce
+from jaxid.consistency.force_reading import ForceReading
 from jaxid.consistency.law import law_of_rows
-from jaxid.consistency.slow_force import SlowForce
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.force_timing import delay_words
 from jaxid.gap import Gap
@@ -66,7 +65,7 @@ def judge(
     estimate: Estimate,
     gaps: Sequence[Gap],
     search: str | None = None,
-    reading: LateForce | SlowForce | None = None,
+    reading: ForceReading | None = None,
 ) -> Judgement:
     """Judge a fit.
 
@@ -261,7 +260,7 @@ def _drifted(session: Session, gaps: Sequence[Gap]) -> list[str]:
     return []
 
 
-def _doubt(remarks: Sequence[Remark], reading: LateForce | SlowForce | None) -> str:
+def _doubt(remarks: Sequence[Remark], reading: ForceReading | None) -> str:
     """Return the reason for which a model that leaves only noise is not called complete; empty if none."""
     if reading is not None:
         return f"{' and '.join(reading.effects)} may stand for the {reading.short}"
