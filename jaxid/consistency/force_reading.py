@@ -41,7 +41,8 @@ class ForceReading:
 
     def beside_effects(self, relation: str) -> str:
         """Return how it compares with the effects: it explains the log, the relation, and the gaps."""
-        named, worst = " and ".join(self.effects), int(np.argmax(self.rival))
-        sizes = f"{self.gap[worst]:.3g} {self.unit}, with {named} {self.rival[worst]:.3g} {self.unit}"
+        *others, last = self.effects
+        named, worst = f"{', '.join(others)} and {last}" if others else last, int(np.argmax(self.rival))
+        sizes = f"{self.gap[worst]:.3g} {self.unit}, with them {self.rival[worst]:.3g} {self.unit}"
         verb = "does" if len(self.effects) == 1 else "do"
         return f"explains the log {relation} {named} {verb} (it leaves a force gap of {sizes})"

@@ -268,6 +268,13 @@ def test_joints_of_unlike_units_are_not_put_in_one_range():
     assert "4 joints" not in words
 
 
+def test_a_fault_in_the_reading_of_the_force_is_no_missing_physics():
+    drift = ("The force seems to drift.", "Subtract the zero of the sensor.")
+    words = _words(render(_discovery(views=(), findings=drift, misread=True)))
+    assert "completeness not known The force seems to drift." in words
+    assert "lacks physics" not in words
+
+
 def test_logs_are_not_mixed_in_the_answer():
     """Steps of a search hold one number for all joints, of the other log."""
     gap = {"unit": "N", "before": [4.1, 3.5], "after": [1.0, 0.02], "noise_floor": [1.0, 0.016]}

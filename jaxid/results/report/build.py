@@ -79,6 +79,7 @@ def discovery_data(result: Discovery) -> ReportData:
         where_plot=where_plot(result),
         experiments=tuple(_experiment(p, session) for p in result.proposals),
         converged=result.converged,
+        misread=result.force_reading is not None,
         **_judged(result),
         **_common(result, content["notes"], "discover"),
     )

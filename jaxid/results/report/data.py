@@ -286,6 +286,7 @@ class ReportData:
         explains: Whether the model explains the log at all.
         identified: Whether the log determines at least one parameter.
         drifted: Whether the simulated position measures nothing, because an open-loop run drifts.
+        misread: Whether a fault of the force's reading explains the log as well as what was found.
         facts: Pairs of a name and a text: machine, date, command, method, settings, log.
         chain: Parts of the drive chain, from the controller to the load.
         friction: Friction over velocity, by joint.
@@ -323,6 +324,7 @@ class ReportData:
     explains: bool = True
     identified: bool = True
     drifted: bool = False
+    misread: bool = False
     facts: tuple[tuple[str, str], ...] = ()
     chain: tuple[ChainPart, ...] = ()
     friction: tuple[FrictionView, ...] = ()

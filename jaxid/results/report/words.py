@@ -95,7 +95,7 @@ def answer(data: ReportData) -> str:
         "nothing_missing": "The residual of the declared model is sensor noise",
         "unexplained": "Model and log disagree, and no known effect explains it",
     }
-    if data.verdict == "found" and not data.explains:
+    if data.verdict == "found" and (data.misread or not data.explains):
         openings = {}
     opening = openings.get(data.verdict or "")
     first = data.findings[0] if data.findings else "The declared model was fitted to the log"
