@@ -79,6 +79,16 @@ def test_a_random_command_is_no_noise():
     assert session.fit.data.force_noise < 0.03 * 3.0
 
 
+@pytest.mark.parametrize("noise", [0.0, NOISE])
+def test_steps_of_a_command_are_no_noise(noise):
+    """Their edges are in every band, and their level is right between them."""
+    levels = np.random.default_rng(4).uniform(-1.5, 1.5, round(SECONDS / 0.25))
+    steps = np.repeat(levels, round(0.25 * RATE))
+    of = dataclasses.replace(setup(noise=noise), loop=Loop(kind="open_loop", input=steps))
+    session = opened(of)
+    assert floor(session) == pytest.approx(floor(session, noise), rel=0.1)
+
+
 def test_a_quantised_command_has_the_noise_of_its_steps():
     of = setup(noise=0.0)
     exact = of.run()["force"]
