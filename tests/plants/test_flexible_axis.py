@@ -240,6 +240,40 @@ def test_an_open_loop_with_a_clearance_is_doubted(tmp_path, folder):
     assert "hangs on every impact in a clearance" in said[1]
 
 
+KNOWN = pytest.mark.xfail(
+    strict=True,
+    reason="the law gives the force to 3e-6 V, under which the rounded corner of the clearance moves both "
+    "Coulomb frictions by 1.5e-4 of their value, 4 standard deviations",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("loop", "method"),
+    [
+        ("open", "prediction_error"),
+        ("closed", "output_error"),
+        ("closed", "inverse_dynamics"),
+        pytest.param("closed", "prediction_error", marks=KNOWN),
+    ],
+)
+def test_a_known_clearance_is_fitted_from_both_encoders(tmp_path, loop, method):
+    log = axes.record(axes.machine().with_effect("backlash", 2, gap=60e-6), duration=4.0)
+    text = axes.text(effects='[[effects]]\nkind = "backlash"\nspring = 1\ngap = { guess = 2e-5 }\n')
+    if loop == "open":
+        text = text[: text.index("[controller]")] + text[text.index("[sensor]") :]
+        text = text.replace('reference = "ref"\n', "")
+    (tmp_path / "case.toml").write_text(text)
+    fitted = jaxid.identify(tmp_path / "case.toml", axes.columns(log), method=method)
+
+    estimate, true = fitted.estimate, axes.TRUTH | {"backlash[spring 1].gap": 60e-6}
+    assert estimate.converged
+    assert all(estimate.identifiable)
+    assert len(estimate.names) == len(true)
+    for name, value, std in zip(estimate.names, estimate.theta, estimate.std, strict=True):
+        assert abs(value - true[name]) < 3.5 * std, name
+
+
 def test_backlash_needs_a_spring(tmp_path):
     (tmp_path / "case.toml").write_text(
         '[plant]\nkind = "axis"\n[plant.parameters]\ninertia = 1.0\n'
