@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from statistics import NormalDist
-
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -33,9 +31,6 @@ _LEVELS = (8, 1000)
 _FACTOR = 3.0
 # Largest ratio of two estimates in different bands of one white noise.
 _ALIKE = 1.5
-# A command is constant over stretches if so few of its changes are steps, each of which exceeds the noise of
-# the other changes by this factor. That noise is taken from a quantile which the steps do not reach.
-_STEPS, _STEP, _QUANTILE = 0.05, 6.0, 0.8
 
 
 def estimated_force_noise(
@@ -68,7 +63,11 @@ def estimated_force_noise(
         law: Command of the declared control law at the logged readings, in units of the command; None: there
             is none that reproduces the logged one.
     """
-    bounds = [_beyond_controller(machine, log), _in_band(machine, log, data, fit), _within_stretches(log)]
+    bounds = [
+        _beyond_controller(machine, log),
+        _in_band(machine, log, data, fit),
+        signals.noise_within_stretches(log.force),
+    ]
     if law is not None:
         bounds.append(signals.high_band_std(log.force - law))
     if data.recipe.median:
@@ -127,15 +126,6 @@ def _high_band(x: Float[np.ndarray, "time k"]) -> np.ndarray:
     spectrum = rfft(window * flat, axis=0)
     f = np.arange(len(spectrum)) / len(x)
     return spectrum[(f > 0.3) & (f < 0.475)] / np.linalg.norm(window)
-
-
-def _within_stretches(log: Log) -> np.ndarray:
-    """Return the noise of each force within stretches of constant command; inf if there are none."""
-    changes = np.abs(np.diff(log.force, axis=0))
-    # Of white noise a change has twice the variance.
-    of_change = np.quantile(changes, _QUANTILE, axis=0) / NormalDist().inv_cdf(0.5 + _QUANTILE / 2)
-    steps = np.mean(changes > _STEP * of_change, axis=0)
-    return np.where((steps > 0) & (steps <= _STEPS), of_change / np.sqrt(2), np.inf)
 
 
 def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.ndarray:

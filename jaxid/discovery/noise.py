@@ -66,7 +66,7 @@ def high_band_force_noise(log: Log, data: Prepared) -> Float[np.ndarray, " m"]:
     also holds the controller's answer to the noise of its encoder. That really acts, but a search must not
     take it for the colour of an effect.
     """
-    force_noise = signals.high_band_std(log.force)
+    force_noise = np.minimum(signals.high_band_std(log.force), signals.noise_within_stretches(log.force))
     return force_noise / signals.median_noise(data.recipe.median) if data.recipe.median else force_noise
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from statistics import NormalDist
 from typing import Any
 
 import jax
@@ -21,6 +22,9 @@ from jaxid.numerics.fft import fast_length, irfft, rfft
 # Periods of the cut-off over which a signal fades out beyond its ends. After as many periods the impulse
 # response of the roll-off has decayed to 10^-4.
 _MEMORY = 30
+# A signal is constant over stretches if so few of its changes are steps, each of which exceeds the noise of
+# the other changes by this factor. That noise is taken from a quantile which the steps do not reach.
+_STEPS, _STEP, _QUANTILE = 0.05, 6.0, 0.8
 
 
 def butterworth_zero_phase(
@@ -366,6 +370,19 @@ def high_band_std_of_rows(x: Float[Array, "k time"]) -> Float[Array, " k"]:
     # `scipy.signal.periodogram` gives the same values five times slower; studies call this for every run.
     power = _medians(band.real**2 + band.imag**2) / np.sum(window**2)
     return xp.sqrt(power / np.log(2.0))
+
+
+def noise_within_stretches(x: Float[np.ndarray, "time k"]) -> Float[np.ndarray, " k"]:
+    """Return the standard deviation of white noise between the steps of signals, by signal.
+
+    It is infinite for a signal that is not constant over long stretches. The edges of its steps are in every
+    band, so that `high_band_std` takes them for noise.
+    """
+    changes = np.abs(np.diff(x, axis=0))
+    # Of white noise a change has twice the variance.
+    of_change = np.quantile(changes, _QUANTILE, axis=0) / NormalDist().inv_cdf(0.5 + _QUANTILE / 2)
+    steps = np.mean(changes > _STEP * of_change, axis=0)
+    return np.where((steps > 0) & (steps <= _STEPS), of_change / np.sqrt(2), np.inf)
 
 
 def _medians(x: Float[Array, "k n"]) -> Float[Array, " k"]:

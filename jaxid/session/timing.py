@@ -40,4 +40,5 @@ def _moved(opened: OpenedLog, delay: float, machine: Machine) -> OpenedLog:
     """Return a log with its force taken back."""
     log = opened.log
     log = replace(log, force=earlier(log.time, log.force, delay, log.hold))
-    return replace(opened, log=log, data=prepared(log, opened.machine(machine), opened.data.recipe))
+    data = prepared(log, opened.machine(machine), opened.data.recipe)
+    return replace(opened, log=log, data=replace(data, force_noise=opened.data.force_noise))

@@ -11,6 +11,7 @@ import jaxid
 from benchmarks.interval_machines import MACHINES
 from jaxid.consistency.timing import SEEMS
 from jaxid.session import open_session
+from jaxid.session.timing import session_with_force_at
 from truth.axis.hidden_effects import SEARCH_CASES
 
 
@@ -53,6 +54,14 @@ def test_a_stated_delay_is_not_questioned():
     case = tomllib.loads(text)
     case["log"]["delay"] = {"force": 1e-6}
     assert said(open_session(case, moved(log, 3), method="inverse_dynamics")) is None
+
+
+def test_a_force_that_is_taken_back_keeps_its_noise():
+    session = opened("axis", 3)
+    late = next(f for f in session.findings if f.what.startswith(SEEMS))
+    back = session_with_force_at(session, 3e-3, late)
+    assert session.fit.data.force_noise == pytest.approx(0.05, rel=0.2)
+    np.testing.assert_array_equal(back.fit.data.force_noise, session.fit.data.force_noise)
 
 
 KINDS = [kind for kind in SEARCH_CASES if kind not in ("actuator_lag", "input_delay")]

@@ -19,6 +19,7 @@ from jaxid.names import LEAVE_ROWS_OUT, SIMULATE_THE_LOOP
 from jaxid.results.report.numbers import percent, plain, scaled_unit
 from jaxid.results.verdict.absurd import Remark, remarks_on, undetermined
 from jaxid.results.verdict.completeness import Residual, position_residuals, residuals_of
+from jaxid.results.verdict.needed_noise import needed_noise
 from jaxid.results.verdict.robot_file import contradicted_file
 from jaxid.session import OpenedLog, Session
 
@@ -37,6 +38,7 @@ _NOTHING = 0.9
 _SLIGHT = 0.05
 # Most sentences on single values; further ones are counted.
 _MOST = 6
+_SEARCH = "The command jaxid discover searches for what is missing."
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,8 @@ def judge(
         complete = None
 
     remarks = remarks_on(session, estimate)
-    doubt = _doubt(remarks, reading)
+    noisy = needed_noise(session, estimate)
+    doubt = _doubt(remarks, reading) or noisy
     complete = None if complete and doubt else complete
     blind = undetermined(estimate)
     identified = len(blind) < len(estimate.names) or not estimate.names
@@ -118,6 +121,7 @@ def judge(
     findings += _completeness_words(
         session, residuals, complete, None if doubtful else search or "none", doubt
     )
+    findings += [_SEARCH] if complete is None and noisy and not search else []
     findings += contradicted_file(session, estimate)
     others = [r for r in remarks if r not in (*impossible, *contrary)]
     findings += _remark_words(others)
@@ -306,7 +310,7 @@ def _completeness_words(
     lines += _loop_words(session)
     machine = session.machine
     if search == "none" and not (machine.unforced(session.fit.log) and machine.plant.coupled):
-        lines.append("The command jaxid discover searches for what is missing.")
+        lines.append(_SEARCH)
     return lines
 
 
