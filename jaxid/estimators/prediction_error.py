@@ -310,11 +310,6 @@ def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estim
             f"the command was computed by the declared law from the logged readings{where}: the logged one "
             "is the same but for white noise of its reading"
         )
-    if machine.plant.coupled and machine.plant.joints > 1 and machine.controller is None:
-        notes.append(
-            "if this arm ran in a loop, its intervals are too narrow: fewer than 95 % held in trials "
-            "without a declared loop (docs/methods.md); declare [controller] and reference if they are known"
-        )
     if min(min(entry["whiteness"]["p"]) for entry in entries) < REJECTS:
         notes.append(
             f"the innovations are not white{_bands(fit, rows)} (rounding, coloured noise or an incomplete "
