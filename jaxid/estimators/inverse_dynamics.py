@@ -14,7 +14,7 @@ from jaxtyping import Bool
 
 from jaxid.arrays import Array
 from jaxid.estimators.common.levenberg_marquardt import DAMPING, Minimum, Transform, levenberg_marquardt
-from jaxid.estimators.common.shapes import phase_starts, shape_starts
+from jaxid.estimators.common.shapes import other_starts
 from jaxid.estimators.estimate import Estimate
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -89,7 +89,7 @@ def inverse_dynamics_steps(
     options = (transform, parameters.bounds, damping)
 
     fits, size = [], np.zeros(())
-    for at in [theta, *phase_starts(machine, theta), *shape_starts(machine, theta)]:
+    for at in [theta, *other_starts(machine, theta, data.q)]:
         fit, size = yield SolveRequest(solve_balance, (plant, places, arrays, at, *options))
         fits.append(fit)
     # Only jumps of the other joints identify dry friction at a joint without an encoder, and the cost has

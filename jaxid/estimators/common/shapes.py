@@ -18,6 +18,8 @@ from jaxid.model.parameter import parameters_of
 _FACTORS = (0.3, 3.0)
 # Changes of the guess of a phase for additional starts [rad].
 _THIRDS = (2 * np.pi / 3, 4 * np.pi / 3)
+# Numbers of turns over the stroke by which a ripple is changed for additional starts.
+_TURNS = (1, 2, 3)
 # Dimensions of parameters of which such factors are no sizes.
 _NO_SIZES = ("1", "angle")
 
@@ -34,6 +36,23 @@ def shapes(machine: Machine) -> Bool[np.ndarray, " p"]:
         found.append(not carries_force(info) and info.dimension not in _NO_SIZES)
 
     return np.asarray(found, dtype=bool)
+
+
+def other_starts(
+    machine: Machine, theta: Float[np.ndarray, " p"], position: Float[np.ndarray, "time n"]
+) -> list[np.ndarray]:
+    """Return the starts beside one of a fit that has several optima: by phase, by turns and by shape.
+
+    Args:
+        machine: The machine.
+        theta: Values of the unknowns at the one start, (p,).
+        position: Positions of the joints, (time, n) [m or rad].
+    """
+    return [
+        *phase_starts(machine, theta),
+        *turn_starts(machine, theta, position),
+        *shape_starts(machine, theta),
+    ]
 
 
 def shape_starts(machine: Machine, theta: Float[np.ndarray, " p"]) -> list[np.ndarray]:
@@ -62,6 +81,49 @@ def phase_starts(machine: Machine, theta: Float[np.ndarray, " p"]) -> list[np.nd
         if info.dimension == "angle":
             out += [np.where(np.arange(len(theta)) == k, theta + turn, theta) for turn in _THIRDS]
     return out
+
+
+def turn_starts(
+    machine: Machine, theta: Float[np.ndarray, " p"], position: Float[np.ndarray, "time n"]
+) -> list[np.ndarray]:
+    """Return starts with a few turns more or less of each ripple over the stroke of its joint.
+
+    A joint is slow where it turns back, at the ends of its stroke, and the ripple of a fast motion lies
+    beyond the band of the filter. A ripple with a turn too many over the stroke is then right at both ends,
+    and nearly as good.
+
+    Args:
+        machine: The machine.
+        theta: Values of the unknowns, (p,).
+        position: Positions of the joints, (time, n) [m or rad].
+    """
+    free, out = machine.parameters.free, []
+    low, stroke = np.min(position, axis=0), np.ptp(position, axis=0)
+    for period, phase in _ripples(machine):
+        effect = free[period].effect
+        assert effect is not None, "a ripple is an effect"
+        joint = int(machine.plant.effects[effect].port)
+        if joint >= len(stroke) or not (stroke[joint] > 0 and theta[period] > 0):
+            continue
+        turns = stroke[joint] / theta[period]
+        for more in (m for k in _TURNS for m in (k, -k) if turns + m > 1):
+            at = theta.copy()
+            at[period] = stroke[joint] / (turns + more)
+            at[phase] += 2 * np.pi * low[joint] * (1 / theta[period] - 1 / at[period])
+            out.append(at)
+    return out
+
+
+def _ripples(machine: Machine) -> list[tuple[int, int]]:
+    """Return the indices of period and phase of each effect in which both are unknown."""
+    of_effect: dict[int, dict[str, int]] = {}
+    for k, (f, shape) in enumerate(zip(machine.parameters.free, shapes(machine), strict=True)):
+        if f.effect is None:
+            continue
+        info = parameters_of(type(machine.plant.effects[f.effect]))[str(f.path[-1])]
+        if info.dimension == "angle" or (shape and info.dimension == "position"):
+            of_effect.setdefault(f.effect, {})[info.dimension] = k
+    return [(e["position"], e["angle"]) for e in of_effect.values() if len(e) == 2]
 
 
 def without_unseen_shapes(estimate: Estimate) -> Estimate:

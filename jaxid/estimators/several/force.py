@@ -11,7 +11,7 @@ import scipy.sparse
 from jaxid.estimators.algebraic.windows import kernels_of as algebraic_kernels
 from jaxid.estimators.algebraic.windows import windows_and_columns, windows_without_rest
 from jaxid.estimators.common.best_bodies import best_bodies
-from jaxid.estimators.common.shapes import phase_starts, shape_starts
+from jaxid.estimators.common.shapes import other_starts
 from jaxid.estimators.common.windowed import Kernels, row_covariance_steps, weights_of_rows
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import linear_scale
@@ -147,7 +147,8 @@ def least_squares_steps(
     first = start_weights([own.signal for own in equations], [int(own.counts.sum()) for own in equations])
     theta = machine.parameters.guess
     ends = []
-    for at in [theta, *phase_starts(machine, theta), *shape_starts(machine, theta)]:
+    position = np.concatenate([part.data.q for part in parts])
+    for at in [theta, *other_starts(machine, theta, position)]:
         ends.append((yield from fit(scale.inward(at), first)))
     best = min(ends, key=lambda end: np.nan_to_num(end.model.cost, nan=np.inf))
     found, weights = yield from descended_steps(fit, best.x, first)
