@@ -449,12 +449,11 @@ def _verdict_on_none(
     if not search.acceptance.above_numerics(steps[0].theta):
         return "nothing_missing"
     rms = _rms(search, search.samples, steps[0].theta)
-    if where.significant and np.any(rms > _ABOVE_FLOOR * search.floor):
-        return "unexplained"
-    if not np.any(rms > _FAR_ABOVE * search.floor):
+    most = _ABOVE_FLOOR if where.significant else _FAR_ABOVE
+    if not np.any(rms > most * search.floor):
         return "nothing_missing"
     floor = np.hypot(search.floor, filter_floor(declared, session.fit))
-    return "unexplained" if np.any(rms > _FAR_ABOVE * floor) else "nothing_missing"
+    return "unexplained" if np.any(rms > most * floor) else "nothing_missing"
 
 
 def _round(search: Search, step: Step) -> Round:

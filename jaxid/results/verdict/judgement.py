@@ -13,7 +13,7 @@ from jaxid.consistency.force_reading import ForceReading
 from jaxid.consistency.law import law_of_rows
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.force_timing import delay_words
-from jaxid.gap import Gap
+from jaxid.gap import DRIFTED, Gap
 from jaxid.machine import Machine
 from jaxid.names import LEAVE_ROWS_OUT, SIMULATE_THE_LOOP
 from jaxid.results.report.numbers import percent, plain, scaled_unit
@@ -26,8 +26,6 @@ from jaxid.session import OpenedLog, Session
 # A force residual of this part of the measured force, or a distance of the simulated position of this part of
 # the motion's standard deviation, is of the order of the motion itself.
 _OF_THE_ORDER = 0.5
-# An open-loop run that is off by this part of the motion has drifted away.
-_DRIFTED = 0.1
 # Ratio of gap to noise beyond which the ratio says more than the colour.
 _CLEARLY = 1.3
 # A residual beyond this many times the measured force is stated without a number.
@@ -256,7 +254,7 @@ def _drifted(session: Session, gaps: Sequence[Gap]) -> list[str]:
     for run, gap in zip(session.runs, gaps, strict=True):
         if _looped(session, run) or run.log.steady is not None:
             continue
-        if gap.simulation is None or np.max(_off(run, gap)) >= _DRIFTED:
+        if gap.simulation is None or np.max(_off(run, gap)) >= DRIFTED:
             return [
                 "The simulated position is no measure here: without a controller the simulation runs in open "
                 "loop, where any small error of the force decides when friction sticks and grows with time."
