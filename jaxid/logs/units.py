@@ -14,7 +14,7 @@ from jaxid.errors import InputError
 from jaxid.logs.readers.table import Assumed
 from jaxid.settings import Actuator, LogTable
 
-_TURN = 2.0 * math.pi
+_TURN, _PERCENT = 2.0 * math.pi, 1e-2
 _TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "in": 0.0254, "inch": 0.0254}
 _DEGREE = _TURN / 360.0
@@ -44,7 +44,7 @@ _KINDS: dict[str, dict[str, float]] = {
     "torque": _TORQUES,
     "current": _CURRENTS,
     "voltage": _VOLTAGES,
-    "percent": {"%": 1e-2},
+    "percent": {"%": _PERCENT},
 }
 # Other spellings, after blanks, products and special letters are made alike.
 _SPELT = {
@@ -415,11 +415,17 @@ def _of_command(unit: Unit | None, drive: int, frame: Frame, path: str) -> float
     if unit.kind != "percent":
         return unit.factor
     rated, supply = frame.drive("rated", drive), frame.drive("supply", drive)
+    if rated is None and supply is None and frame.drive("gain", drive) != 1.0:
+        # The gain is the force for one per cent, such as a hundredth of the rated torque.
+        return unit.factor / _PERCENT
     if (rated is None) == (supply is None):
         what = (
             "the force is in %, of nothing that is stated" if rated is None else "% is of rated or of supply"
         )
-        hint = "state in [actuator] either rated [A] (a current) or supply [V] (a duty cycle)"
+        hint = (
+            "state in [actuator] either rated [A] (a current) or supply [V] (a duty cycle), or gain, "
+            "the force for one %"
+        )
         raise InputError(what, where=path, hint=hint)
     full = rated if rated is not None else supply
     assert full is not None, "one of the two is given"

@@ -92,6 +92,13 @@ def test_parts_of_a_rated_current_or_of_a_supply():
         factor("force", "%", frame("rotary", rated=8.0, supply=24.0))
 
 
+def test_a_gain_is_the_force_for_one_per_cent():
+    """So do drives give their torque: in parts of the rated one, whose hundredth is the gain."""
+    assert factor("force", "%", frame("rotary", gain=0.4)) == pytest.approx(1.0)
+    assert factor("force", "0.1 %", frame("rotary", gain=0.4)) == pytest.approx(0.1)
+    assert factor("force", "%", frame("rotary", gain=2.0, rated=8.0)) == pytest.approx(0.08)
+
+
 def test_signs_are_turned_by_column():
     log = as_log(DATA, {**COLUMNS, "sign": {"force": -1}})
     np.testing.assert_array_equal(log.force[:, 0], -U)
