@@ -129,13 +129,23 @@ def simulation_gap(machine: Machine, replay: Replay, log: Log) -> SimulationGap:
     )
 
 
-def noise_floor(machine: Machine, log: Log, data: Prepared) -> Float[np.ndarray, " n"]:
-    """Compute the RMS force that the sensors' noise alone causes in the band [N or N m], by joint."""
+def noise_floor(
+    machine: Machine, log: Log, data: Prepared, force_std: Float[np.ndarray, " m"] | None = None
+) -> Float[np.ndarray, " n"]:
+    """Compute the RMS force that the sensors' noise alone causes in the band [N or N m], by joint.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        data: The prepared log.
+        force_std: Standard deviation of the logged force if the case states none, in place of the estimated
+            one, (m,).
+    """
     if log.steady is not None:
         return row_noise(machine, log)
     if machine.unforced(log):
         return np.full(log.position.shape[1], np.nan)
-    f, power = noise_density(machine, log, data)
+    f, power = noise_density(machine, log, data, force_std)
     return np.sqrt(np.trapezoid(power, f, axis=0))
 
 

@@ -337,6 +337,7 @@ def start_search(
     baseline = _of_force(session)
     at_fit = session.fit.machine(baseline.machine) if session.more else baseline.machine
     floor = noise_floor(at_fit, log, data)
+    sure = noise_floor(at_fit, log, data, np.zeros(at_fit.gain.shape))
     colour = sensor_colour(at_fit, log, data)
     searched = session.case.searched
     if log.integrated:
@@ -348,7 +349,7 @@ def start_search(
     others = tuple(v.data for v in session.validations)
     guess = tuple(session.machine.parameters.guess)
     if not session.more:
-        return baseline, Search(union, data, floor, colour, others, progress, guess=guess)
+        return baseline, Search(union, data, floor, colour, others, progress, guess=guess, sure=sure)
 
     def view(run: OpenedLog) -> cand.View:
         assert run.own is not None, "every log of several has values of its own, or none"
@@ -367,6 +368,7 @@ def start_search(
         more=tuple((run.data, view(run)) for run in session.more),
         validation_views=tuple(view(run).unscaled() for run in session.validations),
         guess=guess,
+        sure=sure,
     )
     return baseline, search
 

@@ -49,6 +49,8 @@ class Acceptance:
         more: Further logs to fit with their views.
         validation_views: Views of the validation logs; empty: they have none.
         guess: Values of the case's unknowns before any fit; empty: not known.
+        sure: RMS force residual that the noise causes at least, by joint; None: the floor. A noise of the
+            force that is estimated from the log is an upper bound, and counts as none here.
     """
 
     superset: cand.CandidateModel
@@ -60,6 +62,7 @@ class Acceptance:
     more: tuple[tuple[Prepared, cand.View], ...] = ()
     validation_views: tuple[cand.View, ...] = ()
     guess: tuple[float, ...] = ()
+    sure: np.ndarray | None = None
 
     # Least part of a residual that counts as gap.
     least_gap: ClassVar[float] = 0.5
@@ -86,6 +89,11 @@ class Acceptance:
     def _independent(self) -> float:
         """Part of the samples that a filter leaves independent of each other."""
         return self.data.recipe.independent
+
+    @property
+    def _sure_noise(self) -> Float[np.ndarray, " n"]:
+        """Sum of squares of the noise that a model must leave, by joint."""
+        return self.samples.moving.sum(axis=0) * np.square(self.floor if self.sure is None else self.sure)
 
     @property
     def noise(self) -> float:
@@ -218,7 +226,7 @@ class Acceptance:
             return f"{lost} would be next to nothing beside it, as if only signs of the force had to agree"
 
         e = self.residual(new)
-        if self._sum(e) < self._least(fitted) * self.noise:
+        if self._sum(e) < self._least(fitted) * self._sure_noise.sum():
             return "it removes more than the sensors' noise allows"
 
         closed = self.closed_somewhere(self.residual(old), e)
@@ -254,7 +262,7 @@ class Acceptance:
             Satterthwaite (1946) for sums of squares with unequal weights, here by joint.
         """
         count = self._independent * self.samples.moving.sum(axis=0)
-        weight = np.square(self.floor)
+        weight = self._sure_noise / np.maximum(self.samples.moving.sum(axis=0), 1)
         fourth = float(np.sum(count * weight**2))
         if fourth == 0:
             return _LEAST

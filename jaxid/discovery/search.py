@@ -87,6 +87,7 @@ class Search:
         more: Further logs to fit with their views.
         validation_views: Views of the validation logs; empty: they have none.
         guess: Values of the case's unknowns before any fit; empty: not known.
+        sure: Part of the floor that is no upper bound; see `Acceptance`.
     """
 
     superset: cand.CandidateModel
@@ -100,6 +101,7 @@ class Search:
     more: tuple[tuple[Prepared, cand.View], ...] = ()
     validation_views: tuple[cand.View, ...] = ()
     guess: tuple[float, ...] = ()
+    sure: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.acceptance = self._acceptance()
@@ -123,6 +125,7 @@ class Search:
             self.more,
             self.validation_views,
             self.guess,
+            self.sure,
         )
 
     @property

@@ -190,12 +190,18 @@ def test_what_takes_the_sensors_own_noise_away_is_turned_down(axis):
     index = next(c for c in search.superset.candidates if c.kind == "constant_force").index
     off = with_values(search, "constant_force", 5.0)
     assert search.acceptance.objection(index, off, search.theta, None, None, 3) == ""
-    with pytest.MonkeyPatch.context() as patch:
-        # As if the sensors had to leave a hundred times what is there.
-        patch.setattr(search.acceptance, "_noise", 100 * search.acceptance._noise)
-        patch.setattr(search.acceptance, "_numerics", 0.0)
-        why = search.acceptance.objection(index, off, search.theta, None, None, 3)
-    assert why == "it removes more than the sensors' noise allows"
+    loud = 10 * search.acceptance.floor
+
+    def objection(sure: np.ndarray | None) -> str:
+        """As if the noise were a hundred times what is there, or so much at most."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(search.acceptance, "floor", loud)
+            patch.setattr(search.acceptance, "sure", sure)
+            patch.setattr(search.acceptance, "_numerics", np.zeros(1))
+            return search.acceptance.objection(index, off, search.theta, None, None, 3)
+
+    assert objection(None) == objection(loud) == "it removes more than the sensors' noise allows"
+    assert objection(np.zeros(1)) == "", "an upper bound of the noise demands nothing"
 
 
 def test_a_limit_that_leaves_no_inertia_is_turned_down(axis):
