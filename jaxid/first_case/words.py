@@ -68,6 +68,9 @@ _UNITS = {
     "percent": "%",
     "pct": "%",
 }
+# Longest first: mNm ends in Nm, and mA in A.
+_ENDINGS = sorted(_UNITS, key=len, reverse=True)
+_PREFIXED = ("mA", "mV", "kN", "mNm")
 FORCES = ("torque", "force", "current", "voltage", "duty", "command", "load")
 _MEANING = {word: quantity for quantity, words in _QUANTITIES.items() for word in words.split()}
 _ROLE = {word: role for role, words in _ROLES.items() for word in words.split()}
@@ -113,10 +116,13 @@ def meaning_of(name: str) -> Meaning:
         name: The name, as "Lageistwert [mm]", "dof_pos", or "/joint_states.position[elbow]".
     """
     plain = split_unit(name)[0] if " " in name or "(" in name else name
-    parts = _split(plain.translate(_UMLAUTS))
-    unit = ""
-    if len(parts) > 1 and parts[-1] in _UNITS:
-        unit = _UNITS[parts.pop()]
+    rest, unit = _unit_at_end(plain.translate(_UMLAUTS))
+    parts = _split(rest)
+    if not unit and len(parts) > 1:
+        last = parts[-1].casefold() if parts[-1].istitle() and parts[-1] not in _UNITS else parts[-1]
+        if last in _UNITS:
+            parts.pop()
+            unit = _UNITS[last]
     if len(parts) == 1 and parts[0] in ("ms", "us", "ns"):
         return Meaning(name, "time", False, (), parts[0], frozenset(parts))
 
@@ -180,6 +186,24 @@ def _one(found: list[str]) -> str:
     if forces:
         return forces[0]
     return moved[-1] if moved else found[0] if found else ""
+
+
+def _unit_at_end(name: str) -> tuple[str, str]:
+    """Split off the unit in which a name ends; empty if there is none.
+
+    A capital within a unit begins no word: current_mA is in mA, and so is currentmA.
+    """
+    for ending in _ENDINGS:
+        rest = name.removesuffix(ending)
+        if not rest and ending in _PREFIXED:
+            return "", _UNITS[ending]
+        if rest == name or not re.search(r"[A-Za-z0-9]", rest):
+            continue
+        if not rest[-1].isalnum():
+            return rest, _UNITS[ending]
+        if ending in _PREFIXED and _pieces(_split(rest)[-1].casefold()) is not None:
+            return rest, _UNITS[ending]
+    return name, ""
 
 
 def _split(name: str) -> list[str]:

@@ -71,6 +71,16 @@ def test_meaning(name):
         ("ms", "time", "ms"),
         ("axis_pos_mm", "position", "mm"),
         ("speed_rpm", "velocity", "rpm"),
+        # A capital within the unit begins no word.
+        ("current_mA", "current", "mA"),
+        ("motorCurrent_mA", "current", "mA"),
+        ("currentmA", "current", "mA"),
+        ("I_A", "current", "A"),
+        ("force_kN", "force", "kN"),
+        ("torque_mNm", "torque", "mNm"),
+        ("mA", "", "mA"),
+        ("actualPositionDeg", "position", "deg"),
+        ("speedRpm", "velocity", "rpm"),
     ],
 )
 def test_units_at_the_end_of_a_name(name, quantity, unit):
