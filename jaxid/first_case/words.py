@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from jaxid.logs.readers.dialect import split_unit
+from jaxid.logs.unit_endings import UNITS, unit_ending
 
 # Words by quantity. A force has several kinds, from the surest witness of the torque on.
 _QUANTITIES: dict[str, str] = {
@@ -53,24 +54,8 @@ _LETTERS = {
 _OF_Q = re.compile(r"q[a-z]")
 ROTARY = frozenset("winkel drehwinkel angle theta phi drehzahl omega rpm dtheta thetadot dof tau".split())
 LINEAR = frozenset("weg hub displacement hoehe height distance".split())
-# Endings of a name that are units, as in position_mm or t_us.
-_UNITS = {
-    **{u: u for u in "s ms us ns mm um cm deg rad mrad rev rpm A mA V mV N kN Nm mNm lbf kgf counts".split()},
-    "sec": "s",
-    "degrees": "deg",
-    "radps": "rad/s",
-    "rads": "rad/s",
-    "degs": "deg/s",
-    "dps": "deg/s",
-    "mps": "m/s",
-    "mmps": "mm/s",
-    "mms": "mm/s",
-    "percent": "%",
-    "pct": "%",
-}
-# Longest first: mNm ends in Nm, and mA in A.
-_ENDINGS = sorted(_UNITS, key=len, reverse=True)
-_PREFIXED = ("mA", "mV", "kN", "mNm")
+# Units with a capital, which begins no word.
+_PREFIXED = ("mNm", "mA", "mV", "kN")
 FORCES = ("torque", "force", "current", "voltage", "duty", "command", "load")
 _MEANING = {word: quantity for quantity, words in _QUANTITIES.items() for word in words.split()}
 _ROLE = {word: role for role, words in _ROLES.items() for word in words.split()}
@@ -119,10 +104,10 @@ def meaning_of(name: str) -> Meaning:
     rest, unit = _unit_at_end(plain.translate(_UMLAUTS))
     parts = _split(rest)
     if not unit and len(parts) > 1:
-        last = parts[-1].casefold() if parts[-1].istitle() and parts[-1] not in _UNITS else parts[-1]
-        if last in _UNITS:
+        last = parts[-1].casefold() if parts[-1].istitle() and parts[-1] not in UNITS else parts[-1]
+        if last in UNITS:
             parts.pop()
-            unit = _UNITS[last]
+            unit = UNITS[last]
     if len(parts) == 1 and parts[0] in ("ms", "us", "ns"):
         return Meaning(name, "time", False, (), parts[0], frozenset(parts))
 
@@ -193,16 +178,15 @@ def _unit_at_end(name: str) -> tuple[str, str]:
 
     A capital within a unit begins no word: current_mA is in mA, and so is currentmA.
     """
-    for ending in _ENDINGS:
+    if name in _PREFIXED:
+        return "", UNITS[name]
+    rest, unit = unit_ending(name)
+    if unit:
+        return rest, unit
+    for ending in _PREFIXED:
         rest = name.removesuffix(ending)
-        if not rest and ending in _PREFIXED:
-            return "", _UNITS[ending]
-        if rest == name or not re.search(r"[A-Za-z0-9]", rest):
-            continue
-        if not rest[-1].isalnum():
-            return rest, _UNITS[ending]
-        if ending in _PREFIXED and _pieces(_split(rest)[-1].casefold()) is not None:
-            return rest, _UNITS[ending]
+        if rest != name and _pieces(_split(rest)[-1].casefold()) is not None:
+            return rest, UNITS[ending]
     return name, ""
 
 

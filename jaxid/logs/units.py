@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.logs.readers.table import Assumed
+from jaxid.logs.unit_endings import unit_ending
 from jaxid.settings import Actuator, LogTable
 
 _TURN, _PERCENT = 2.0 * math.pi, 1e-2
@@ -46,6 +47,8 @@ _KINDS: dict[str, dict[str, float]] = {
     "voltage": _VOLTAGES,
     "percent": {"%": _PERCENT},
 }
+# Units of the kinds without a conversion.
+_SI = {"time": "s", "length": "m", "angle": "rad", "force": "N", "torque": "N m"}
 # Other spellings, after blanks, products and special letters are made alike.
 _SPELT = {
     "degree": "deg",
@@ -266,7 +269,7 @@ def converted(
     for quantity, values in groups.items():
         units, said = _units_of(quantity, values.shape[1], names[quantity], of_file, stated, frame, path)
         if quantity == "force":
-            said += _of_motor(units, stated, frame, path)
+            said += _of_motor(units, names[quantity], stated, frame, path)
         factors = [_factor(u, quantity, k, table, frame, path) for k, u in enumerate(units)]
         factors = np.array(factors) * np.broadcast_to(np.asarray(signs.get(quantity, 1.0)), values.shape[1])
         out[quantity] = values if np.all(factors == 1.0) else values * factors
@@ -313,6 +316,8 @@ def _units_of(
     for text in texts:
         unit = parse_unit(text) if text else None
         units.append(unit if fits(unit, quantity) else None)
+    if not any(texts):
+        said += _of_names(quantity, names)
     # A reference is recorded as the position is, unless its column says otherwise.
     if (
         quantity == "reference"
@@ -326,6 +331,18 @@ def _units_of(
     return units, said
 
 
+def _of_names(quantity: str, names: Sequence[str]) -> list[Assumed]:
+    """Return the SI unit that is taken for a column whose name ends in another unit."""
+    for name in names:
+        unit = parse_unit(unit_ending(name)[1])
+        if unit is None or not fits(unit, quantity) or unit.factor == 1.0 or unit.kind not in _SI:
+            continue
+        taken = _SI[unit.kind] + {0: "", 1: "/s", 2: "/s^2"}[unit.per]
+        ends = f"the name '{name}' ends in {unit.text}, and no unit is stated"
+        return [Assumed(f"units.{quantity}", taken, f"{ends}; state {unit.text} if that is right")]
+    return []
+
+
 def time_factor(table: LogTable, of_file: str) -> float:
     """Return the factor from the time column to seconds: stated, or of the file."""
     stated = (table.units or {}).get("time")
@@ -334,12 +351,21 @@ def time_factor(table: LogTable, of_file: str) -> float:
 
 
 def _of_motor(
-    units: Sequence[Unit | None], stated: Mapping[str, Any], frame: Frame, path: str
+    units: Sequence[Unit | None],
+    names: Sequence[str],
+    stated: Mapping[str, Any],
+    frame: Frame,
+    path: str,
 ) -> list[Assumed]:
-    """Check the command of a drive with a torque constant against the unit that the file states."""
+    """Check the command of a drive with a torque constant against the unit that file or name states."""
     if frame.actuator.torque_constant is None or "force" in stated:
         return []
     unit = units[0]
+    named = parse_unit(unit_ending(names[0])[1])
+    if unit is None and named is not None and named.kind == "current" and named.factor != 1.0:
+        hint = f'state units.force = "{named.text}" in [log], or "A"'
+        what = f"the name '{names[0]}' ends in {named.text}, and [log] states no unit"
+        raise InputError(what, where=path, hint=hint)
     if unit is None:
         reason = "torque_constant goes with a current; state units.force for a voltage or a duty cycle"
         return [Assumed("units.force", "A", reason)]

@@ -7,9 +7,9 @@ from jaxid.build import build_machine
 from jaxid.case.case import load_case
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import as_log
-from jaxid.logs.units import Frame, parse_unit
+from jaxid.logs.units import Frame, converted, parse_unit
 from jaxid.session import open_session
-from jaxid.settings import Actuator
+from jaxid.settings import Actuator, LogTable
 
 SAMPLES = 400
 T = np.arange(SAMPLES) / 200
@@ -97,6 +97,33 @@ def test_a_gain_is_the_force_for_one_per_cent():
     assert factor("force", "%", frame("rotary", gain=0.4)) == pytest.approx(1.0)
     assert factor("force", "0.1 %", frame("rotary", gain=0.4)) == pytest.approx(0.1)
     assert factor("force", "%", frame("rotary", gain=2.0, rated=8.0)) == pytest.approx(0.08)
+
+
+def assumed_of(quantity: str, name: str, **actuator) -> list[str]:
+    """Return what is said of a column without a unit, by its name."""
+    stated = {"units": {"force": actuator.pop("unit")}} if "unit" in actuator else {}
+    table = LogTable(position="q", force="u", **stated)
+    groups, names = {quantity: np.ones((3, 1))}, {quantity: [name]}
+    return [a.reason for a in converted(groups, names, {}, table, frame("rotary", **actuator), "log.csv")[1]]
+
+
+def test_a_name_that_ends_in_a_unit_is_questioned():
+    (said,) = assumed_of("position", "pos_deg")
+    assert said == "the name 'pos_deg' ends in deg, and no unit is stated; state deg if that is right"
+    for quantity, name in (
+        ("position", "pos_rad"),
+        ("position", "pos"),
+        ("position", "pos_ms"),
+        ("force", "u_mA"),
+    ):
+        assert assumed_of(quantity, name) == [], name
+
+
+def test_a_current_in_milliamperes_is_not_taken_for_amperes():
+    with pytest.raises(InputError, match="'u_mA' ends in mA, and .log. states no unit; state units.force"):
+        assumed_of("force", "u_mA", torque_constant=0.05)
+    assert assumed_of("force", "u_mA", torque_constant=0.05, unit="A") == []
+    assert "goes with a current" in assumed_of("force", "u_A", torque_constant=0.05)[0]
 
 
 def test_signs_are_turned_by_column():
