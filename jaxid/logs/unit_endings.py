@@ -20,12 +20,12 @@ UNITS = {
     "pct": "%",
 }
 # Longest first: mNm ends in Nm, and mA in A.
-ENDINGS = sorted(UNITS, key=len, reverse=True)
+_ENDINGS = sorted(UNITS, key=len, reverse=True)
 
 
 def unit_ending(name: str) -> tuple[str, str]:
     """Split off the unit in which a name ends behind a sign; empty if there is none."""
-    for ending in ENDINGS:
+    for ending in _ENDINGS:
         rest = name.removesuffix(ending)
         if rest != name and re.search(r"[A-Za-z0-9]", rest) and not rest[-1].isalnum():
             return rest, UNITS[ending]

@@ -316,8 +316,6 @@ def _units_of(
     for text in texts:
         unit = parse_unit(text) if text else None
         units.append(unit if fits(unit, quantity) else None)
-    if not any(texts):
-        said += _of_names(quantity, names)
     # A reference is recorded as the position is, unless its column says otherwise.
     if (
         quantity == "reference"
@@ -328,6 +326,8 @@ def _units_of(
         unit = need_unit(stated["position"], "position", path)
         said.append(Assumed("units.reference", stated["position"], "that of the position"))
         units = [unit] * width
+    elif not any(texts):
+        said += _of_names(quantity, names)
     return units, said
 
 

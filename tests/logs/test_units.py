@@ -99,31 +99,29 @@ def test_a_gain_is_the_force_for_one_per_cent():
     assert factor("force", "%", frame("rotary", gain=2.0, rated=8.0)) == pytest.approx(0.08)
 
 
-def assumed_of(quantity: str, name: str, **actuator) -> list[str]:
-    """Return what is said of a column without a unit, by its name."""
-    stated = {"units": {"force": actuator.pop("unit")}} if "unit" in actuator else {}
-    table = LogTable(position="q", force="u", **stated)
-    groups, names = {quantity: np.ones((3, 1))}, {quantity: [name]}
-    return [a.reason for a in converted(groups, names, {}, table, frame("rotary", **actuator), "log.csv")[1]]
+def assumed_of(names: dict[str, str], units: dict[str, str] | None = None, **actuator) -> list[str]:
+    """Return what is said of columns by their names, beside the units that are stated."""
+    table = LogTable(position="q", force="u", units=units)
+    groups, columns = {q: np.ones((3, 1)) for q in names}, {q: [name] for q, name in names.items()}
+    found = converted(groups, columns, {}, table, frame("rotary", **actuator), "log.csv")[1]
+    return [assumed.reason for assumed in found]
 
 
 def test_a_name_that_ends_in_a_unit_is_questioned():
-    (said,) = assumed_of("position", "pos_deg")
+    (said,) = assumed_of({"position": "pos_deg"})
     assert said == "the name 'pos_deg' ends in deg, and no unit is stated; state deg if that is right"
-    for quantity, name in (
-        ("position", "pos_rad"),
-        ("position", "pos"),
-        ("position", "pos_ms"),
-        ("force", "u_mA"),
-    ):
-        assert assumed_of(quantity, name) == [], name
+    for name in ("pos_rad", "pos", "pos_ms"):
+        assert assumed_of({"position": name}) == [], name
+    assert assumed_of({"force": "u_mA"}) == [], "the gain is of the column as it is"
+    both = {"position": "pos_deg", "reference": "target_deg"}
+    assert assumed_of(both, {"position": "deg"}) == ["that of the position"]
 
 
 def test_a_current_in_milliamperes_is_not_taken_for_amperes():
     with pytest.raises(InputError, match="'u_mA' ends in mA, and .log. states no unit; state units.force"):
-        assumed_of("force", "u_mA", torque_constant=0.05)
-    assert assumed_of("force", "u_mA", torque_constant=0.05, unit="A") == []
-    assert "goes with a current" in assumed_of("force", "u_A", torque_constant=0.05)[0]
+        assumed_of({"force": "u_mA"}, torque_constant=0.05)
+    assert assumed_of({"force": "u_mA"}, {"force": "A"}, torque_constant=0.05) == []
+    assert "goes with a current" in assumed_of({"force": "u_A"}, torque_constant=0.05)[0]
 
 
 def test_signs_are_turned_by_column():
