@@ -1,7 +1,8 @@
-"""An option of pytest, `--outcomes FILE`: what every test did, with the commit, the date and the machine.
+"""An option of pytest, `--outcomes FILE`: what every test did, with its commit, its date and the machine.
 
 Each test adds a line of JSON as it ends, so that a run which is cut off leaves what it saw. Tests that the
-file already holds for the same commit are not run again: the same command goes on.
+file already holds for the same commit are not run again: the same command goes on. Those of other commits
+stay until they are run again.
 """
 
 import datetime
@@ -17,24 +18,38 @@ import pytest
 def _commit():
     found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True)
     changed = subprocess.run(["git", "status", "--porcelain", "-uno"], capture_output=True, text=True)
+    # The file itself changes as it is written.
+    others = [line for line in changed.stdout.splitlines() if not line.endswith(".jsonl")]
 
-    return found.stdout.strip() + ("+changes" if changed.stdout.strip() else "")
+    return found.stdout.strip() + ("+changes" if others else "")
+
+
+def stored(path: Path) -> dict[str, dict]:
+    """Return the last row of each test in a file."""
+    if not path.exists():
+        return {}
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+
+    return {row["test"]: row for row in rows}
 
 
 class Outcomes:
-    """A results file of a run of tests."""
+    """A results file of runs of tests."""
 
     def __init__(self, path: Path):
         self.path = path
-        self.head = {"commit": _commit(), "cores": os.cpu_count(), "python": platform.python_version()}
-        self.seen = {}
+        self.of_run = {
+            "commit": _commit(),
+            "date": datetime.date.today().isoformat(),
+            "cores": os.cpu_count(),
+            "python": platform.python_version(),
+        }
+        self.rows = stored(path)
+        self.seen = {test for test, row in self.rows.items() if row["commit"] == self.of_run["commit"]}
 
-        rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-        if rows and rows[0]["commit"] == self.head["commit"]:
-            self.seen = {row["test"]: row for row in rows[1:]}
-        else:
-            self.head["date"] = datetime.date.today().isoformat()
-            path.write_text(json.dumps(self.head) + "\n")
+    def tidy(self):
+        """Write one row a test, in their order."""
+        self.path.write_text("".join(json.dumps(self.rows[test]) + "\n" for test in sorted(self.rows)))
 
     def pytest_collection_modifyitems(self, config, items):
         done = [item for item in items if item.nodeid in self.seen]
@@ -57,7 +72,7 @@ class Outcomes:
             row["why"] = (crash.message if crash else str(report.longrepr)).splitlines()[0][:300]
 
         with self.path.open("a") as file:
-            file.write(json.dumps(row) + "\n")
+            file.write(json.dumps(row | self.of_run) + "\n")
 
 
 def pytest_addoption(parser):
@@ -74,4 +89,6 @@ def pytest_configure(config):
         outcomes = Outcomes(path)
         if hasattr(config, "workerinput"):
             outcomes.pytest_runtest_logreport = lambda report: None
+        else:
+            outcomes.tidy()
         config.pluginmanager.register(outcomes, "outcomes")
