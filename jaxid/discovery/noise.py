@@ -11,8 +11,8 @@ from jaxid.gap import noise_density
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
-from jaxid.numerics import filters as signals
 from jaxid.numerics.coloured_noise import NoiseModel
+from jaxid.simulation.sensor_noise import high_band_force_noise
 
 # Part of the force that filtering, holding and integrating leave wrong in any model: an effect with a smaller
 # RMS cannot be distinguished from these errors.
@@ -57,17 +57,6 @@ def sensor_colour(
         folded = _folded(np.interp(grid, f, density), step) + numerics / (rate / 2)
         models.append(NoiseModel.of_density(folded, rate, _ORDER))
     return tuple(models)
-
-
-def high_band_force_noise(log: Log, data: Prepared) -> Float[np.ndarray, " m"]:
-    """Estimate the standard deviation of the logged force from its high band, in its units, (m,).
-
-    It is an upper bound of the noise that `jaxid.simulation.sensor_noise.force_noise` returns: in a loop it
-    also holds the controller's answer to the noise of its encoder. That really acts, but a search must not
-    take it for the colour of an effect.
-    """
-    force_noise = np.minimum(signals.high_band_std(log.force), signals.noise_within_stretches(log.force))
-    return force_noise / signals.median_noise(data.recipe.median) if data.recipe.median else force_noise
 
 
 def _folded(density: np.ndarray, step: int) -> np.ndarray:

@@ -160,6 +160,8 @@ class Prepared:
             `jaxid.dynamics.hidden_joints`).
         force_noise: Estimated standard deviation of the logged force, in units of the command, (m,); None:
             not estimated.
+        high_band: Noise of the force in its high band, as it was logged, (m,); None: that of the log. See
+            `jaxid.simulation.sensor_noise.high_band_force_noise`.
     """
 
     q: Float[np.ndarray, "time n"]
@@ -176,6 +178,7 @@ class Prepared:
     measured: tuple[bool, ...] = (True,)
     steps: int = 1
     force_noise: Float[np.ndarray, " m"] | None = None
+    high_band: Float[np.ndarray, " m"] | None = None
 
     @property
     def times(self) -> Float[np.ndarray, " kept"]:

@@ -10,6 +10,7 @@ from jaxid.logs.late import earlier
 from jaxid.machine import Machine
 from jaxid.session.opened import OpenedLog, Session
 from jaxid.session.preparing import prepared
+from jaxid.simulation.sensor_noise import high_band_force_noise
 
 
 def states_timing(session: Session) -> bool:
@@ -38,7 +39,9 @@ def session_with_force_at(session: Session, delay: float, finding: Finding) -> S
 
 def _moved(opened: OpenedLog, delay: float, machine: Machine) -> OpenedLog:
     """Return a log with its force taken back."""
-    log = opened.log
+    log, before = opened.log, opened.data
+    # A force between the samples is smoother than its noise, and steps are no longer steps.
+    noise = {"force_noise": before.force_noise, "high_band": high_band_force_noise(log, before)}
     log = replace(log, force=earlier(log.time, log.force, delay, log.hold))
-    data = prepared(log, opened.machine(machine), opened.data.recipe)
-    return replace(opened, log=log, data=replace(data, force_noise=opened.data.force_noise))
+    data = prepared(log, opened.machine(machine), before.recipe)
+    return replace(opened, log=log, data=replace(data, **noise))

@@ -39,6 +39,19 @@ def force_noise(machine: Machine, data: Prepared) -> Float[np.ndarray, " m"]:
     return np.broadcast_to(np.zeros(()) if known is None else np.asarray(known), machine.gain.shape)
 
 
+def high_band_force_noise(log: Log, data: Prepared) -> Float[np.ndarray, " m"]:
+    """Estimate the standard deviation of the logged force from its high band, in its units, (m,).
+
+    It is an upper bound of the noise that `force_noise` returns: in a loop it also holds the controller's
+    answer to the noise of its encoder. That really acts, but a search must not take it for the colour of an
+    effect. Of a force that was taken back in time it is that of the force as it was logged.
+    """
+    if data.high_band is not None:
+        return data.high_band
+    found = np.minimum(signals.high_band_std(log.force), signals.noise_within_stretches(log.force))
+    return found / signals.median_noise(data.recipe.median) if data.recipe.median else found
+
+
 def position_density(
     machine: Machine, log: Log, data: Prepared
 ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f n"]]:

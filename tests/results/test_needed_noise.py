@@ -41,23 +41,23 @@ def test_three_times_the_noise_of_the_log_is_named(needed, named):
     case, log = case_and_log(MOTOR, noise=1.0)
     session = open_session(case, log)
     assert session.fit.data.force_noise == pytest.approx(1.0, rel=0.1)
-    clause = needed_noise(session, SimpleNamespace(details={"noise": {"force": np.array([needed])}}))
-    assert (
-        clause.startswith(f"the fit needs noise of force with a standard deviation of {needed:.0f}") == named
-    )
+    fit = {"method": "prediction_error", "machine": session.machine}
+    details = {"noise": {"force": np.array([needed])}}
+    clause = needed_noise(session, SimpleNamespace(**fit, details=details))
+    assert clause.startswith("the fit needs noise of force with a standard deviation of") == named
     assert bool(clause) == named
 
 
 @pytest.mark.slow
 def test_a_lag_that_passes_for_a_delay_is_not_complete():
-    """The inertia is ten standard deviations off, and the filtered force has too few samples to show it."""
+    """The inertia is ten standard deviations off: the fit needs six times the noise of a rounded duty."""
     lagging = dataclasses.replace(MOTOR.machine, effects=EFFECTS | LAG)
     case, log = case_and_log(dataclasses.replace(MOTOR, machine=lagging))
     fitted = jaxid.identify(case, log)
-    assert all(residual.complete for residual in fitted.judgement.residuals)
-    assert fitted.model_complete is None
-    assert "Whether the model is complete is not known: the fit needs noise of force" in str(fitted)
-    assert "The command jaxid discover searches for what is missing." in str(fitted)
+    assert fitted.model_complete is not True
+    noise = {"noise": {"force": fitted.estimate.details["noise"]["force"]}}
+    fit = SimpleNamespace(method="prediction_error", machine=fitted.estimate.machine, details=noise)
+    assert "the log shows at most 0.289 in the units of its column" in needed_noise(fitted.session, fit)
 
     found = jaxid.discover(case, log)
     assert found.kinds == ["actuator_lag"]

@@ -14,7 +14,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from jaxid.discovery.evidence import Whitener
-from jaxid.discovery.noise import NUMERICS, high_band_force_noise, sensor_colour
+from jaxid.discovery.noise import NUMERICS, sensor_colour
 from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.gap import ForceGap, SimulationGap, noise_density, row_noise
 from jaxid.logs.soundness import position_levels
@@ -25,7 +25,7 @@ from jaxid.session import OpenedLog
 from jaxid.simulation.force_balance import ForceData, inertial_force
 from jaxid.simulation.noisy_loop import noisy_readings
 from jaxid.simulation.replay import make_replay
-from jaxid.simulation.sensor_noise import position_noise
+from jaxid.simulation.sensor_noise import high_band_force_noise, position_noise
 
 # Part of the half sampling rate of the kept samples that holds the band of the filter, see
 # `jaxid.logs.prepare.A_PERIOD`. Beyond it the filtered residual is rounding and errors of numerics.
