@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from truth.arm.two_links import TwoLinks, run_sampled
+from truth.arm.two_links_case import plant_lines
 from truth.axis.cases import case_text
 from truth.axis.machines import EMPS_LOOP, Setup, emps_like, moves, multisine
 from truth.axis.slow_axis import slow_axis
@@ -204,13 +205,7 @@ def arm(seed: int, loop: str, sensor: str) -> Run:
 
     off = dict(zip(true, (1.5 ** rng.choice([-1.0, 1.0], len(true))).tolist(), strict=True))
     entry = lambda name: f"{{ guess = {true[name] * off[name]!r}, true = {true[name]!r} }}"
-    lines = ["[plant]", 'kind = "serial_arm"', "gravity_vector = [0.0, -9.81, 0.0]"]
-    for k, a in ((1, 0.0), (2, links.length)):
-        sideways = "0.0" if k == 1 else entry("first_moment_y[2]")
-        lines += ["[[plant.links]]", 'joint = "revolute"', "alpha_deg = 0.0", f"a = {a!r}"]
-        lines += [f"mass = {(links.m1, links.m2)[k - 1]!r}"]
-        lines += [f"first_moment = [{entry(f'first_moment_x[{k}]')}, {sideways}, 0.0]"]
-        lines += [f"inertia = [0.0, 0.0, 0.0, 0.0, 0.0, {entry(f'inertia_zz[{k}]')}]"]
+    lines = plant_lines(links, entry)
     for kind, key in (("viscous_friction", "coefficient"), ("coulomb_friction", "level")):
         row = ", ".join(entry(f"{kind}[{k}].{key}") for k in (1, 2))
         lines += ["[[effects]]", f'kind = "{kind}"', f"{key} = [{row}]"]

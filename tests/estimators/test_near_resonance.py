@@ -9,6 +9,7 @@ import pytest
 
 import jaxid
 from truth.arm.two_links import TwoLinks, run_sampled
+from truth.arm.two_links_case import plant_lines
 
 RATE, SECONDS, NOISE = 100.0, 20.0, 1e-4
 LINKS = TwoLinks(viscous=(0.05, 0.03), coulomb=(0.0, 0.0))
@@ -46,13 +47,7 @@ def log():
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
     entry = lambda name: f"{{ guess = {1.5 * TRUE[name]!r} }}"
-    lines = ["[plant]", 'kind = "serial_arm"', "gravity_vector = [0.0, -9.81, 0.0]"]
-    for k, a in ((1, 0.0), (2, LINKS.length)):
-        sideways = "0.0" if k == 1 else entry("first_moment_y[2]")
-        lines += ["[[plant.links]]", 'joint = "revolute"', "alpha_deg = 0.0", f"a = {a!r}"]
-        lines += [f"mass = {(LINKS.m1, LINKS.m2)[k - 1]!r}"]
-        lines += [f"first_moment = [{entry(f'first_moment_x[{k}]')}, {sideways}, 0.0]"]
-        lines += [f"inertia = [0.0, 0.0, 0.0, 0.0, 0.0, {entry(f'inertia_zz[{k}]')}]"]
+    lines = plant_lines(LINKS, entry)
     friction = ", ".join(entry(f"viscous_friction[{k}].coefficient") for k in (1, 2))
     lines += ["[[effects]]", 'kind = "viscous_friction"', f"coefficient = [{friction}]"]
     lines += ["[log]", 'time = "t"', 'position = ["q1", "q2"]', 'force = ["u1", "u2"]']

@@ -1,8 +1,11 @@
 """A case of two links under a law that feeds a model forward; true values are those of the equations."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
+from truth.arm.two_links import TwoLinks
 
 # Drive gains, viscous and Coulomb friction, as the case lists them; nothing of it in its guesses.
 TRUTH = np.array([0.93, 1.06, 1.5, 0.8, 4.0, 2.4])
@@ -56,6 +59,18 @@ sample_rate = 4000.0
 initial_position = [0.3, 0.2]
 substeps = 1
 """
+
+
+def plant_lines(links: TwoLinks, entry: Callable[[str], str]) -> list[str]:
+    """Return the table [plant] of two links under gravity; `entry` gives an unknown by its name."""
+    lines = ["[plant]", 'kind = "serial_arm"', "gravity_vector = [0.0, -9.81, 0.0]"]
+    for k, a in ((1, 0.0), (2, links.length)):
+        sideways = "0.0" if k == 1 else entry("first_moment_y[2]")
+        lines += ["[[plant.links]]", 'joint = "revolute"', "alpha_deg = 0.0", f"a = {a!r}"]
+        lines += [f"mass = {(links.m1, links.m2)[k - 1]!r}"]
+        lines += [f"first_moment = [{entry(f'first_moment_x[{k}]')}, {sideways}, 0.0]"]
+        lines += [f"inertia = [0.0, 0.0, 0.0, 0.0, 0.0, {entry(f'inertia_zz[{k}]')}]"]
+    return lines
 
 
 def written(folder: Path, law: str = "", duration: float = 3.0, sensor: str = "", **swap: str) -> Path:
