@@ -25,7 +25,7 @@ from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.servo_rate import leaves_rate_open, with_rate_of_log
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
-from jaxid.estimators.ticks import starts_beside, with_std_of_ticks
+from jaxid.estimators.ticks import best_ticks, with_equal_ticks, with_std_of_ticks
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 
 # Starts from which logs that are fitted together are fitted; each fit simulates all of them many times.
 _STARTS_TOGETHER = 2
-# Misfit of a fit without noise, as a multiple of the best one's, up to which its mean readings are compared.
-_NEARLY = 1.5
 # Keys of each law that give its command a scale; without one that is known, the scale is free.
 _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
 
@@ -106,7 +104,7 @@ def _fitted_steps(
 
 
 def _by_mean_readings(machine: Machine, log: Log, plain: Estimate, **options: Any) -> Steps[Estimate]:
-    """Return the best fit of the mean readings, near a fit without noise and at the ticks beside its delay.
+    """Return the best fit of the mean readings, near a fit without noise and at the best tick of its delay.
 
     A command that is held over several ticks leaves a minimum at each of them. The noise changes the misfit
     by more than one tick of the delay does, so that only mean readings show which is the best.
@@ -123,14 +121,11 @@ def _by_mean_readings(machine: Machine, log: Log, plain: Estimate, **options: An
     found = yield from fitted_with_noise(machine, log, plain.theta, **options)
     if found is None:
         return plain
-    for start in starts_beside(machine, found.theta):
-        near = yield from output_error_steps(machine, log, start=start, **options)
-        if not near.converged or misfit(near) > _NEARLY * misfit(plain):
-            continue
-        other = yield from fitted_with_noise(machine, log, near.theta, **options)
-        if other is not None and misfit(other) < misfit(found):
-            found = other
-    return found
+    best, *equal = (yield from best_ticks(machine, log, found.theta, options.get("numerics"))) or [None]
+    if best is None:
+        return found
+    other = (yield from fitted_with_noise(machine, log, best, **options)) or found
+    return with_equal_ticks(other, equal)
 
 
 def common_scale_group(machine: Machine, parts: Sequence[Part]) -> tuple[int, ...]:
