@@ -21,6 +21,7 @@ from jaxid.effects.inertia import AddedMass
 from jaxid.errors import InputError
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
+from jaxid.estimators.ticks import std_of_ticks
 from jaxid.estimators.unforced import base_of, common_scale_group, stated_gains, without
 from jaxid.estimators.within_prior.prior import Prior
 from jaxid.experiment_design.in_loop import (
@@ -281,12 +282,20 @@ class _Present:
         parts: The logs that there are.
         noise: Standard deviation of a reading, (n,): that of the sensor, or as much as a fit leaves.
         result: The fit of the logs.
+        least: Least standard deviation of each unknown, (p,): that of one tick for a delay of a loop whose
+            period is stated; NaN: none.
     """
 
     machine: Machine
     parts: tuple[Part, ...]
     noise: Float[np.ndarray, " n"]
     result: Identification | None
+    least: Float[np.ndarray, " p"]
+
+    def std(self, information: _Information, held: Collection[int]) -> Float[np.ndarray, " p"]:
+        """Return the standard deviations by an information; see `_Information.std`."""
+        std = information.std(self.machine, held)
+        return np.where(np.isfinite(std), np.fmax(std, self.least), std)
 
 
 def designed_unforced(
@@ -343,10 +352,10 @@ def designed_unforced(
         values=signal,
         group=group,
         base=base,
-        std=whole.std(machine, held),
-        plain=informed[0].std(machine, held),
-        before=known.std(machine, held) if before else None,
-        stating={machine.parameters.names[k]: whole.std(machine, (k,)) for k in gains},
+        std=present.std(whole, held),
+        plain=present.std(informed[0], held),
+        before=present.std(known, held) if before else None,
+        stating={machine.parameters.names[k]: present.std(whole, (k,)) for k in gains},
         second=second,
         noise=present.noise,
         peaks=problem.peaks(signal),
@@ -381,7 +390,7 @@ def _present(case: Case, result: Identification | None, rate: float) -> _Present
         if std is None:
             raise no_noise(case, "position", "position_noise or position_resolution, or name a log")
         noise = np.broadcast_to(np.asarray(std, float), case.plant.joints)
-        return _Present(_with_noise(machine, noise), (), noise, None)
+        return _Present(_with_noise(machine, noise), (), noise, None, _least_std(case, machine))
 
     if not result.estimate.converged:
         what = "the fit of the present log did not converge"
@@ -397,7 +406,14 @@ def _present(case: Case, result: Identification | None, rate: float) -> _Present
     std = machine.sensor.position_std
     noise = left if std is None else np.maximum(left, np.asarray(std, float))
     machine = _with_noise(machine, noise)
-    return _Present(machine, tuple(parts_of(session.with_machine(machine))), noise, result)
+    parts = tuple(parts_of(session.with_machine(machine)))
+    return _Present(machine, parts, noise, result, _least_std(case, machine))
+
+
+def _least_std(case: Case, machine: Machine) -> Float[np.ndarray, " p"]:
+    """Return the least standard deviation of each unknown, as a fit of its log prints it, (p,)."""
+    stated = case.controller is not None and case.controller.period is not None
+    return std_of_ticks(machine) if stated else np.full(len(machine.parameters.free), np.nan)
 
 
 def _with_noise(machine: Machine, noise: Float[np.ndarray, " n"]) -> Machine:
@@ -551,7 +567,7 @@ def _second_logs(
         part = Part.alone(machine, log)
         of_both = whole + _Information.of(part, present.noise, width)
         scaled = not common_scale_group(machine, [part])
-        out.append(SecondLog(what, values, of_both.std(present.machine, () if scaled else held)))
+        out.append(SecondLog(what, values, present.std(of_both, () if scaled else held)))
     return tuple(out)
 
 

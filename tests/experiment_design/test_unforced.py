@@ -140,7 +140,12 @@ def test_it_adds_to_a_log_that_is_there():
     fitted = jaxid.identify(tomllib.loads(CASE), slow)
     ratio = design.before / fitted.estimate.std
     assert np.all((ratio > 0.5) & (ratio < 2.0)), ratio
-    assert np.all(design.std < 0.6 * design.before)
+    delay = list(TRUE).index("controller.delay")
+    assert design.std[delay] == pytest.approx(1 / RATE / np.sqrt(12), rel=1e-9)
+    # The same log a second time would leave the square root of a half.
+    others = np.delete(design.std / design.before, delay)
+    assert np.all(others < np.sqrt(0.5)), others
+    assert np.prod(others) ** (1 / len(others)) < 0.6, others
 
 
 def case(**changes: object) -> dict:
