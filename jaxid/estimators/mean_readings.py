@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,12 +11,13 @@ from jaxtyping import Float
 
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.output_error import output_error_steps
+from jaxid.estimators.several.parts import Part
 from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import Steps
 from jaxid.simulation.noisy_loop import ReadingNoise, estimated_noise
-from jaxid.simulation.replay import make_replay
+from jaxid.simulation.replay import Numerics, make_replay
 
 # Number of times that the noise of the encoder is estimated, and the unknowns refitted.
 _RENEWALS = 2
@@ -23,7 +25,7 @@ _RENEWALS = 2
 
 def fitted_with_noise(
     machine: Machine,
-    log: Log,
+    log: Log | Sequence[Part],
     start: Float[np.ndarray, " p"],
     *,
     follows: bool = True,
@@ -32,8 +34,8 @@ def fitted_with_noise(
     """Fit the mean readings of a loop whose controller reads a noisy encoder.
 
     Args:
-        machine: The machine.
-        log: The log.
+        machine: The machine of all logs.
+        log: The log, or the parts of several.
         start: Values of the unknowns near the optimum, at which the noise is estimated first.
         follows: Whether the fit follows runs with noise, or one run without, see
             `jaxid.simulation.noisy_loop.ReadingNoise`.
@@ -43,25 +45,50 @@ def fitted_with_noise(
         The estimate; None if nothing is known of the noise, or the fit does not converge.
     """
     best: Estimate | None = None
-    noise: ReadingNoise | None = None
+    noise: list[ReadingNoise | None] = []
     if options.get("on", "position") != "position":
         return None
+    parts = [Part.alone(machine, log)] if isinstance(log, Log) else list(log)
     for _ in range(_RENEWALS):
-        at = machine.with_estimate(start if best is None else best.theta)
-        numerics = options.get("numerics") or choose_numerics(at, log)
-        replay = make_replay(at, log, numerics)
-        noise = estimated_noise(at, log, replay, follows=follows, before=noise)
-        if noise is None:
+        at = start if best is None else best.theta
+        noise = noise_of_parts(parts, at, options.get("numerics"), follows=follows, before=noise)
+        if not any(noise):
             return best
-        new = yield from output_error_steps(machine, log, start=at.parameters.guess, noise=noise, **options)
+        new = yield from output_error_steps(machine, parts, start=at, noise=noise, **options)
         if not new.converged:
             return best
         best = replace(new, notes=(*new.notes, _words(noise)))
     return best
 
 
-def _words(noise: ReadingNoise) -> str:
-    """Return the note on the noise with which a loop was simulated."""
-    std = ", ".join(f"{s:.2g}" for s in noise.std)
-    counts = " and rounding to counts" if np.any(noise.count > 0) else ""
+def noise_of_parts(
+    parts: Sequence[Part],
+    theta: Float[np.ndarray, " p"],
+    numerics: Numerics | None = None,
+    *,
+    follows: bool = True,
+    before: Sequence[ReadingNoise | None] = (),
+) -> list[ReadingNoise | None]:
+    """Estimate the noise of the encoder in the loop of each log, at values of all unknowns.
+
+    Args:
+        parts: The logs.
+        theta: Values of the unknowns, (p,).
+        numerics: Settings of the integration; None: chosen from machines and logs.
+        follows: See `jaxid.simulation.noisy_loop.ReadingNoise`.
+        before: Noise of each log at values nearby; empty: it is estimated anew.
+    """
+    found: list[ReadingNoise | None] = []
+    for part, near in zip(parts, before or [None] * len(parts), strict=True):
+        at = part.at(theta)
+        replay = make_replay(at, part.log, numerics or choose_numerics(at, part.log))
+        found.append(estimated_noise(at, part.log, replay, follows=follows, before=near))
+    return found
+
+
+def _words(noise: Sequence[ReadingNoise | None]) -> str:
+    """Return the note on the noise with which the loops were simulated."""
+    known = [one for one in noise if one is not None]
+    std = ", ".join(f"{s:.2g}" for s in np.max([one.std for one in known], axis=0))
+    counts = " and rounding to counts" if any(np.any(one.count > 0) for one in known) else ""
     return f"the loop reads its encoder with noise of {std} (standard deviation){counts}: the mean is fitted"

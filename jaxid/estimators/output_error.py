@@ -26,6 +26,7 @@ from jaxid.estimators.output_fit import (
     OutputFit,
     measured_and_weight,
     output_residuals,
+    outputs_of,
 )
 from jaxid.estimators.output_profile import profile_steps
 from jaxid.estimators.round_the_loop import shift_steps, with_lasting_errors
@@ -33,7 +34,6 @@ from jaxid.estimators.several.parts import Part, by_log
 from jaxid.estimators.several.sums import shares, stacked
 from jaxid.estimators.several.weights import disagreement
 from jaxid.estimators.simulated_output import (
-    choose_numerics,
     kept_delay,
     need_loop,
     need_output_force,
@@ -125,7 +125,7 @@ def output_error_steps(
     profile: Sequence[str] = (),
     on: str = "position",
     minimiser: str | Minimiser | None = None,
-    noise: ReadingNoise | None = None,
+    noise: Sequence[ReadingNoise | None] | None = None,
     command_noise: Sequence[np.ndarray] | None = None,
     tolerance: float = TOLERANCE,
 ) -> Steps[Estimate]:
@@ -136,8 +136,8 @@ def output_error_steps(
         log: The log, or the parts of several.
         start, numerics, hessian, profile, on, minimiser: See `output_error`.
         solver: One of `jaxid.names.SOLVERS` for the chosen settings of the integration; None: fixed steps.
-        noise: Noise of the encoder that the loop of a log alone is simulated with, whose mean readings are
-            then compared; None: it is simulated without noise.
+        noise: Noise of the encoder that the loop of each log is simulated with, whose mean readings are then
+            compared; None: it is simulated without noise.
         command_noise: Standard deviation of the logged force of each log, in units of the command, (m,) each,
             whose effect on an open loop is simulated; None: the force counts as exact.
         tolerance: Part of the cost by which a fit of several logs has converged.
@@ -161,7 +161,8 @@ def output_error_steps(
         parts = [replace(part, machine=part.at(start)) for part in parts]
 
     first = "position" if on == "both" else on
-    fit = OutputFit(machine, _outputs(parts, numerics, solver, first, noise), first, minimiser, tolerance)
+    outputs = outputs_of(parts, first, numerics, solver, noise)
+    fit = OutputFit(machine, outputs, first, minimiser, tolerance)
     theta = machine.parameters.guess
     if machine.unknown_reference is not None:
         # With a wrong reference the machine's parameters would diverge: fit the reference's unknowns first.
@@ -198,22 +199,6 @@ def _along_segments(fit: OutputFit, theta: np.ndarray) -> Steps[np.ndarray | Non
     fitted = parts if len(parts) > 1 else parts[0].log
     found = yield from output_error_steps(machine, fitted, start=theta)
     return found.theta if found.converged and np.all(np.isfinite(found.theta)) else None
-
-
-def _outputs(
-    parts: Sequence[Part],
-    numerics: Numerics | None,
-    solver: str | None,
-    on: str,
-    noise: ReadingNoise | None,
-) -> tuple[Output, ...]:
-    """Return the outputs of all logs; one number of steps serves them, so that they share compiled code."""
-    chosen = [numerics or choose_numerics(part.machine, part.log, solver=solver) for part in parts]
-    most, alone = max(n.substeps for n in chosen), len(parts) == 1
-    return tuple(
-        Output.of(part, replace(n, substeps=most), on, alone, noise)
-        for part, n in zip(parts, chosen, strict=True)
-    )
 
 
 def _of_course(machine: Machine, active: np.ndarray) -> np.ndarray:
@@ -314,7 +299,7 @@ def _estimate(
         precision, more = with_lasting_errors(precision, lasting)
     elif fit.pushed:
         theta, precision, more = yield from _pushed(fit, end, moving, precision, command_noise)
-    elif len(moving) > 1:
+    elif len(moving) > 1 and not any(output.noise for output in fit.outputs):
         theta, precision, more = yield from _without_noise(fit, end, moving, precision)
     remarks += more
     if profile:

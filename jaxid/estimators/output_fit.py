@@ -17,6 +17,7 @@ from jaxid.estimators.several.parts import Part, Scale
 from jaxid.estimators.several.sums import summed
 from jaxid.estimators.several.weights import descended_steps, start_weights
 from jaxid.estimators.simulated_output import (
+    choose_numerics,
     forgets,
     measured_output,
     output_residual,
@@ -185,6 +186,28 @@ def measured_and_weight(part: Part, on: str) -> tuple[np.ndarray, np.ndarray]:
         # A free motion ends at rest, where one rounding error stands in every reading.
         weight = weight * rounded_readings(part.machine, part.log)
     return measured, weight
+
+
+def outputs_of(
+    parts: Sequence[Part],
+    on: str = "position",
+    numerics: Numerics | None = None,
+    solver: str | None = None,
+    noise: Sequence[ReadingNoise | None] | None = None,
+) -> tuple[Output, ...]:
+    """Return the outputs of all logs; one number of steps serves them, so that they share compiled code.
+
+    Args:
+        parts: The logs.
+        on: One of `jaxid.names.OUTPUTS`.
+        numerics: Settings of the integration; None: chosen from machines and logs.
+        solver: One of `jaxid.names.SOLVERS` for chosen settings; None: fixed steps.
+        noise: Noise of the encoder in the loop of each log; None: all are simulated without noise.
+    """
+    chosen = [numerics or choose_numerics(part.machine, part.log, solver=solver) for part in parts]
+    most, alone = max(n.substeps for n in chosen), len(parts) == 1
+    of_logs = zip(parts, chosen, noise or [None] * len(parts), strict=True)
+    return tuple(Output.of(part, replace(n, substeps=most), on, alone, own) for part, n, own in of_logs)
 
 
 @dataclass(frozen=True)

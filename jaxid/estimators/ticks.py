@@ -9,15 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.output_fit import Output, OutputFit
+from jaxid.estimators.mean_readings import noise_of_parts
+from jaxid.estimators.output_fit import OutputFit, outputs_of
 from jaxid.estimators.several.parts import Part
-from jaxid.estimators.simulated_output import choose_numerics
-from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER
 from jaxid.numerics.lanes import Steps
-from jaxid.simulation.noisy_loop import ReadingNoise, estimated_noise
-from jaxid.simulation.replay import Numerics, make_replay
+from jaxid.simulation.noisy_loop import ReadingNoise
+from jaxid.simulation.replay import Numerics
 
 # Ticks beside the best one that are compared, and parts of a row of the log: a command that is held from row
 # to row leaves the cost several minima along the delay.
@@ -26,9 +25,10 @@ _TICKS, _ROWS = (-2, -1, 1, 2), (-1.0, -0.5, 0.5, 1.0)
 _MOST = 24
 # Number of times that the noise of the encoder is estimated, and the unknowns refitted.
 _RENEWALS = 4
-# Rise of the squared residual, in variances of a reading, up to which a tick explains a log about as well.
-_EQUAL = 6.0
-# Cost of a fit without noise, as a multiple of the least one, up to which its mean readings are compared.
+# Rise of the squared residual, in variances of a reading: up to which a tick explains a log about as well,
+# below which it has settled, and beyond which a tick is out of the question.
+_EQUAL, _SAME, _FAR = 6.0, 0.3, 50.0
+# Squared residual without noise, as a multiple of the least one, up to which mean readings are fitted.
 _NEARLY = 1.5
 
 
@@ -47,45 +47,43 @@ def at_ticks(machine: Machine, theta: Float[np.ndarray, " p"], step: int = 0) ->
 
 
 def best_ticks(
-    machine: Machine, log: Log, theta: Float[np.ndarray, " p"], numerics: Numerics | None = None
+    machine: Machine, parts: Sequence[Part], theta: Float[np.ndarray, " p"], numerics: Numerics | None = None
 ) -> Steps[list[Float[np.ndarray, " p"]]]:
-    """Find the ticks of the unknown delays at which the mean readings of the loop are nearest to a log.
+    """Find the ticks of the unknown delays at which the mean readings of the loop are nearest to the logs.
 
     At each tick the delays are held while the others are fitted. Fits in which they are free end in the
     minimum that is next to their start, and each tick may have its own.
 
     Args:
-        machine: The machine, with its controller.
-        log: The log, without a force.
+        machine: Machine of all logs, with its controller.
+        parts: The logs, without a force.
         theta: Values of a fit, (p,).
-        numerics: Settings of the integration; None: chosen from machine and log.
+        numerics: Settings of the integration; None: chosen from machines and logs.
 
     Returns:
-        Values of the unknowns at the best ticks, (p,), and behind them those at others that explain the log
+        Values of the unknowns at the best ticks, (p,), and behind them those at others that explain the logs
         about as well; empty if there is no unknown delay, or nothing is known of the noise of the encoder.
     """
     if machine.controller is None or not np.any(_delays(machine)):
         return []
-    row, nearest = log.period / machine.controller.period, _Held.at(machine, theta, 0)
-    beside = sorted({*_TICKS, *(round(part * row) for part in _ROWS)} - {0})
-    least = float(np.min(np.round(theta[_delays(machine)] / machine.controller.period)))
+    period = machine.controller.period
+    row = max(part.log.period for part in parts) / period
+    beside = sorted({*_TICKS, *(round(share * row) for share in _ROWS)} - {0}, key=abs)
+    least = -float(np.min(np.round(theta[_delays(machine)] / period)))
 
-    found = {0: (yield from nearest.fitted(log, numerics))}
+    fits = _HeldFits(machine, parts, numerics)
+    found = {0: (yield from fits.at(at_ticks(machine, theta)))}
     best = 0
     while True:
-        near = [best + step for step in beside if best + step not in found and best + step >= -least]
+        near = [best + step for step in beside if best + step not in found and best + step >= least]
         for step in near[: _MOST - len(found)]:
-            held = _Held.at(machine, theta, step)
-            limit = _NEARLY * min(fit.plain for fit in found.values())
-            found[step] = yield from held.fitted(log, numerics, limit)
-        before, best = best, min(found, key=lambda step: found[step].cost)
+            start = at_ticks(machine, theta, step)
+            found[step] = yield from fits.at(start, list(found.values()))
+        before, best = best, min(found, key=lambda step: found[step].chi)
         if best == before or len(found) >= _MOST:
             break
-    if not np.isfinite(found[best].cost):
-        return []
-    spare = max(int(np.sum(log.measured)) * log.samples - len(theta), 1)
-    ranked = sorted(found.values(), key=lambda fit: fit.cost)
-    return [fit.theta for fit in ranked if spare * (fit.cost / ranked[0].cost - 1) < _EQUAL]
+    ranked = sorted(found.values(), key=lambda fit: fit.chi)
+    return [fit.theta for fit in ranked if fit.chi - ranked[0].chi < _EQUAL]
 
 
 @dataclass(frozen=True)
@@ -94,59 +92,74 @@ class _HeldFit:
 
     Args:
         theta: Values of all unknowns, (p,).
-        plain: Half the sum of squares of the loop without noise.
-        cost: The same of its mean readings; infinite if they were not fitted.
+        plain: Minus twice the logarithm of the likelihood of the loop without noise, but for a constant.
+        chi: The same of its mean readings; infinite if they were not fitted.
     """
 
     theta: Float[np.ndarray, " p"]
     plain: float
-    cost: float
+    chi: float
 
 
 @dataclass(frozen=True)
-class _Held:
-    """A machine whose unknown delays are held at ticks of its loop."""
+class _HeldFits:
+    """Fits of logs with the unknown delays of the loop held.
+
+    Args:
+        machine: Machine of all logs.
+        parts: The logs.
+        numerics: Settings of the integration; None: chosen from machines and logs.
+    """
 
     machine: Machine
-    theta: Float[np.ndarray, " p"]
+    parts: Sequence[Part]
+    numerics: Numerics | None
 
-    @classmethod
-    def at(cls, machine: Machine, theta: Float[np.ndarray, " p"], step: int) -> _Held:
-        """Hold the delays some ticks from the nearest ones."""
-        return cls(machine, at_ticks(machine, theta, step))
+    def at(self, start: Float[np.ndarray, " p"], others: Sequence[_HeldFit] = ()) -> Steps[_HeldFit]:
+        """Fit all but the delays from a start: without noise, then the mean readings.
 
-    def fitted(self, log: Log, numerics: Numerics | None, limit: float = np.inf) -> Steps[_HeldFit]:
-        """Fit the other unknowns, and if the cost without noise keeps a limit those of the mean readings."""
-        plain, cost = yield from self._fitted(log, numerics, self.theta, None)
-        if not np.isfinite(cost) or cost > limit:
-            return _HeldFit(plain, cost, np.inf)
-        theta, noise = plain, self._noise(log, numerics, plain)
+        Mean readings are left out where the loop without noise is far from that of other fits, and are not
+        refined where they are.
+        """
+        theta, plain = yield from self._fitted(start, [])
+        nearest = min((fit.plain for fit in others), default=np.inf)
+        least = min((fit.chi for fit in others), default=np.inf)
+        out = _HeldFit(theta, plain, np.inf)
+        if not np.isfinite(plain) or plain > nearest + self._samples * np.log(_NEARLY):
+            return out
+        noise: list[ReadingNoise | None] = []
         for _ in range(_RENEWALS):
-            if noise is None:
-                return _HeldFit(plain, cost, np.inf)
-            theta, mean_cost = yield from self._fitted(log, numerics, theta, noise)
-            noise = self._noise(log, numerics, theta)
-        return _HeldFit(theta, cost, mean_cost)
+            noise = noise_of_parts(self.parts, out.theta, self.numerics, before=noise)
+            if not any(noise):
+                break
+            theta, chi = yield from self._fitted(out.theta, noise)
+            settled = abs(chi - out.chi) < _SAME
+            out = _HeldFit(theta, plain, chi)
+            if settled or chi > least + _FAR:
+                break
+        return out
 
-    def _noise(
-        self, log: Log, numerics: Numerics | None, theta: Float[np.ndarray, " p"]
-    ) -> ReadingNoise | None:
-        """Estimate the noise of the encoder at some values."""
-        at = self.machine.with_estimate(theta)
-        return estimated_noise(at, log, make_replay(at, log, numerics or choose_numerics(at, log)))
+    @property
+    def _samples(self) -> int:
+        """Number of readings in all logs."""
+        return sum(part.log.samples * sum(part.log.measured) for part in self.parts)
 
     def _fitted(
-        self, log: Log, numerics: Numerics | None, start: Float[np.ndarray, " p"], noise: ReadingNoise | None
+        self, start: Float[np.ndarray, " p"], noise: Sequence[ReadingNoise | None]
     ) -> Steps[tuple[Float[np.ndarray, " p"], float]]:
-        """Return the values of a fit from a start, and its cost."""
-        machine = self.machine.with_estimate(start)
-        chosen = numerics or choose_numerics(machine, log)
-        output = Output.of(Part.alone(machine, log), chosen, "position", True, noise)
-        fit = OutputFit(machine, (output,), "position")
+        """Return the values of a fit, and minus twice the logarithm of its likelihood but for a constant."""
+        parts = [replace(part, machine=part.at(start)) for part in self.parts]
+        outputs = outputs_of(parts, numerics=self.numerics, noise=noise or None)
+        fit = OutputFit(self.machine.with_estimate(start), outputs, "position")
         moving = fit.active.copy()
-        moving[: len(self.theta)] &= ~_delays(machine)
+        moving[: len(start)] &= ~_delays(self.machine)
         end = yield from fit.steps(start, active=moving)
-        return end.theta, end.cost if end.converged else np.inf
+        if not end.converged:
+            return end.theta, np.inf
+        # The noise of each log is that of its own residual.
+        counts = [int(rows.counts.sum()) for rows in end.logs]
+        left = [float(np.sum(np.square(rows.residual))) / n for rows, n in zip(end.logs, counts, strict=True)]
+        return end.theta, float(np.dot(counts, np.log(np.maximum(left, 1e-300))))
 
 
 def with_equal_ticks(estimate: Estimate, equal: Sequence[Float[np.ndarray, " p"]]) -> Estimate:

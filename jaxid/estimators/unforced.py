@@ -93,8 +93,8 @@ def _fitted_steps(
     for start in starts:
         fits.append((yield from fit(fitted, parts, start=start, numerics=numerics, **options)))
     result = min(fits, key=lambda e: (not e.converged, misfit(e)))
-    if len(parts) == 1 and result.converged and by_joints is None:
-        result = yield from _by_mean_readings(fitted, parts[0].log, result, numerics=numerics, **options)
+    if result.converged and by_joints is None:
+        result = yield from _by_mean_readings(fitted, parts, result, numerics=numerics, **options)
     if base is None:
         return result
     scale = scale_by_effort(session, parts, result) if scaled else None
@@ -103,29 +103,28 @@ def _fitted_steps(
     return with_free_scale(result, machine, group, base)
 
 
-def _by_mean_readings(machine: Machine, log: Log, plain: Estimate, **options: Any) -> Steps[Estimate]:
-    """Return the best fit of the mean readings, near a fit without noise and at the best tick of its delay.
+def _by_mean_readings(
+    machine: Machine, parts: Sequence[Part], plain: Estimate, **options: Any
+) -> Steps[Estimate]:
+    """Return the best fit of the mean readings, at the ticks of the delay near that of a fit without noise.
 
-    A command that is held over several ticks leaves a minimum at each of them. The noise changes the misfit
-    by more than one tick of the delay does, so that only mean readings show which is the best.
+    The noise changes the misfit by more than one tick of the delay does, so that only mean readings show
+    which is the best.
 
     Args:
-        machine: The machine.
-        log: The log.
+        machine: Machine of all logs.
+        parts: The logs.
         plain: A fit without noise.
         options: Further arguments of `output_error_steps`.
 
     Returns:
         The fit; that without noise if nothing is known of the noise.
     """
-    found = yield from fitted_with_noise(machine, log, plain.theta, **options)
-    if found is None:
-        return plain
-    best, *equal = (yield from best_ticks(machine, log, found.theta, options.get("numerics"))) or [None]
-    if best is None:
-        return found
-    other = (yield from fitted_with_noise(machine, log, best, **options)) or found
-    return with_equal_ticks(other, equal)
+    at, *equal = (yield from best_ticks(machine, parts, plain.theta, options.get("numerics"))) or [
+        plain.theta
+    ]
+    found = yield from fitted_with_noise(machine, parts, at, **options)
+    return plain if found is None else with_equal_ticks(found, equal)
 
 
 def common_scale_group(machine: Machine, parts: Sequence[Part]) -> tuple[int, ...]:

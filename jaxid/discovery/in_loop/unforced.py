@@ -298,13 +298,12 @@ def refitted(session: Session, final: Machine, base: int | None) -> Estimate:
     """
     stated, demands = session.case.output_error, session.case.identification
     options: dict[str, Any] = {"minimiser": stated.minimiser, "hessian": demands.hessian}
-    held = None
     if not session.more:
         # A joint of an arm has the load of its links along the log.
         final = session.fit.machine(final)
-        held = run_alone(fitted_with_noise(final, session.fit.log, final.parameters.guess, **options))
+    fitted = parts_of(session.with_machine(final)) if session.more else session.fit.log
+    held = run_alone(fitted_with_noise(final, fitted, final.parameters.guess, **options))
     if held is None:
-        fitted = parts_of(session.with_machine(final)) if session.more else session.fit.log
         held = run_alone(output_error_steps(final, fitted, start=None, **options))
     if base is None:
         return held
