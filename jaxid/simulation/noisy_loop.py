@@ -164,7 +164,7 @@ def estimated_noise(
     if found is None:
         return None
     noise, loop = found
-    smooth = np.asarray(_mean_readings(noise.on(loop.replay), machine.plant))
+    smooth = np.asarray(mean_readings(noise.on(loop.replay), machine.plant))
     return replace(noise, shift=loop.mean(noise) - smooth)
 
 
@@ -237,7 +237,7 @@ class _Loop:
         return np.mean([self._mean(noise, draws) for draws in self.draws], axis=0)
 
     def _mean(self, noise: ReadingNoise, draws: np.ndarray) -> Float[np.ndarray, "time n"]:
-        return np.asarray(_mean_readings(noise.rounded(self.replay, draws), self.plant))
+        return np.asarray(mean_readings(noise.rounded(self.replay, draws), self.plant))
 
     def squares(self, noise: ReadingNoise) -> Float[np.ndarray, " n"]:
         """Return the sum of squares that mean readings of the first draws leave of the log, by joint."""
@@ -297,7 +297,8 @@ def drawn_readings(
 
 
 @kept_jit
-def _mean_readings(replay: NoisyReplay, plant: Plant) -> Array:
+def mean_readings(replay: Replay, plant: Plant) -> Array:
+    """Return the positions of a loop, or the mean readings of one with noise, (time, n)."""
     return replay(plant).position
 
 

@@ -19,9 +19,12 @@ def noise(shift: float) -> ReadingNoise:
     return ReadingNoise(np.array([1.5e-3]), np.array([2e-4]), np.zeros(2), shift=moved)
 
 
-@pytest.mark.parametrize(("shift", "kept"), [(3e-4, True), (1.5e-2, False)])
-def test_an_unstable_loop_gives_other_models_no_mean_readings(shift, kept, monkeypatch):
+@pytest.mark.parametrize(
+    ("shift", "nearer", "kept"), [(3e-4, False, True), (1.5e-2, False, False), (1.5e-2, True, True)]
+)
+def test_an_unstable_loop_gives_other_models_no_mean_readings(shift, nearer, kept, monkeypatch):
     monkeypatch.setattr(positions, "estimated_noise", lambda *args, **kwargs: noise(shift))
+    monkeypatch.setattr(positions, "_nearer", lambda *args: nearer)
     monkeypatch.setattr(LoopSamples, "_alone", lambda self, superset, added, theta: (None, None))
     before = LoopSamples(None, None, None, (None, None), np.ones((5, 1), bool), np.ones((5, 1)), noise(1e-5))
     after = before.renewed(None, (), np.zeros(1))

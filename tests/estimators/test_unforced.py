@@ -67,6 +67,19 @@ def identify(case: str, log: dict[str, np.ndarray]) -> jaxid.Identification:
     return jaxid.identify(tomllib.loads(case), log)
 
 
+@pytest.mark.slow
+def test_a_command_that_noise_drives_into_its_limit_leaves_a_complete_model():
+    """The loop without noise is off by six times the noise: mean readings decide, and a sentence says so."""
+    result = identify(
+        CASE.replace("kp = 2.0", "kp = 2.0\nlimit = { guess = 0.3 }"), log(saturation={"limit": 0.12})
+    )
+    assert result.model_complete is True
+    assert any("The loop answers the noise of its encoder" in line for line in result.findings)
+    for name, true in {**TRUE, "controller.limit": 0.12}.items():
+        found = result.parameters[name]
+        assert abs(found.value - true) < 3 * found.std, name
+
+
 def test_a_known_gain_gives_all_values_from_guesses_four_times_off():
     result = identify(CASE, log())
     assert result.estimate.converged

@@ -28,7 +28,7 @@ from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import in_threads
 from jaxid.session import OpenedLog
-from jaxid.simulation.noisy_loop import ReadingNoise, drawn_readings, estimated_noise
+from jaxid.simulation.noisy_loop import ReadingNoise, drawn_readings, estimated_noise, mean_readings
 from jaxid.simulation.replay import Numerics, Replay, make_replay
 from jaxid.simulation.step_size import fastest_rate
 
@@ -146,7 +146,10 @@ class LoopSamples:
         """
         machine, replay = self._alone(superset, added, theta)
         noise = estimated_noise(machine, self.log, replay, follows=False)
-        return replace(self, noise=None) if noise is not None and _shaken(noise) else self.with_noise(noise)
+        if noise is None:
+            return self
+        astray = _shaken(noise) and not _nearer(noise, machine, self.log, replay)
+        return replace(self, noise=None if astray else noise)
 
     def drawn_noise(
         self, superset: cand.CandidateModel, added: Sequence[cand.Candidate], theta: np.ndarray, runs: int
@@ -299,6 +302,16 @@ def _shaken(noise: ReadingNoise) -> bool:
     return bool(np.any(np.sqrt(np.mean(np.square(noise.shift), axis=0)) > _SHAKEN * size))
 
 
+def _nearer(noise: ReadingNoise, machine: Machine, log: Log, replay: Replay) -> bool:
+    """Check that mean readings are nearer to a log than the positions of the loop without noise."""
+    replay = replay.following(machine.parameters.places, machine.parameters.guess)
+    left = [
+        np.sum(np.square((log.filled - np.asarray(mean_readings(run, machine.plant)))[:, list(log.measured)]))
+        for run in (noise.on(replay), replay)
+    ]
+    return bool(left[0] < left[1])
+
+
 @dataclass
 class LoopAcceptance(Acceptance):
     """Tests of models by the positions of their simulated loops.
@@ -348,12 +361,15 @@ class LoopSearch(Search):
         coarse: Function of a model that returns values of its unknowns from which fits start, beside those
             of the model: an incomplete model fits best in another valley than a complete one.
         afar: Starts far from where an incomplete model ends; None: there are none.
+        by_mean_readings: Function of a model that returns all unknowns of the superset as a fit of its mean
+            readings gives them; None if there is no such fit.
     """
 
     positions: PositionDomain | None = None
     logs: tuple[Loops, ...] = ()
     coarse: Callable[[Model], list[np.ndarray]] = lambda model: []
     afar: Afar | None = None
+    by_mean_readings: Callable[[Model], np.ndarray | None] = lambda model: None
     _fits: dict[frozenset[int], np.ndarray] = field(default_factory=dict)
     _searched: set[frozenset[int]] = field(default_factory=set)
     _drawn: dict[tuple[bytes, int], np.ndarray | None] = field(default_factory=dict)
@@ -488,17 +504,27 @@ class LoopSearch(Search):
         if len(starts) > 1:
             model = replace(model, theta=self.fit_from(starts, index))
         for _ in range(_RENEWALS):
-            renewed: list[Loops] = []
-            for samples in self.logs:
-                parts = [part.renewed(self.superset, model.added, model.theta) for part in samples.parts]
-                renewed.append(samples.with_parts(parts) if isinstance(samples, JoinedLoops) else parts[0])
-            self.logs, self._drawn = tuple(renewed), {}
-            self.samples, *others = self.logs
-            self.acceptance.samples, self.acceptance.others = self.samples, others
+            self._renew_noise(model)
+            if model.added and any(part.noise is None for part in self.samples.parts):
+                # The noise moves this loop far: a fit without it has other values, and no mean readings.
+                theta = self.by_mean_readings(model)
+                if theta is not None:
+                    model = replace(model, theta=theta)
+                    self._renew_noise(model)
             model = replace(model, theta=self.fit(model.theta, index))
             if model.added:
                 model = replace(model, theta=self._at_other_delays(model.theta, index))
         return model
+
+    def _renew_noise(self, model: Model) -> None:
+        """Estimate the noise of the encoder in the loops of all logs anew, beside a model."""
+        renewed: list[Loops] = []
+        for samples in self.logs:
+            parts = [part.renewed(self.superset, model.added, model.theta) for part in samples.parts]
+            renewed.append(samples.with_parts(parts) if isinstance(samples, JoinedLoops) else parts[0])
+        self.logs, self._drawn = tuple(renewed), {}
+        self.samples, *others = self.logs
+        self.acceptance.samples, self.acceptance.others = self.samples, others
 
     def _at_other_delays(self, theta: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Return the best fit from other delays about that of a fit.

@@ -217,6 +217,16 @@ def _search(
         out[:, np.concatenate([superset.base, *[c.index for c in added]]).astype(int)] = points
         return out
 
+    def by_mean_readings(model: Model) -> np.ndarray | None:
+        whole = machine_with(machine, superset, model.added, model.theta)[0]
+        logs = parts_of(session.with_machine(whole))
+        found = run_alone(fitted_with_noise(whole, logs, whole.parameters.guess))
+        if found is None or not np.all(np.isfinite(found.theta)):
+            return None
+        out = model.theta.copy()
+        out[np.concatenate([superset.base, *[c.index for c in model.added]]).astype(int)] = found.theta
+        return out
+
     @functools.cache
     def scaled() -> dict[tuple[str, int], np.ndarray]:
         # The declared model may have run far away: the best of the points about its guesses has not.
@@ -240,6 +250,7 @@ def _search(
         ),
         coarse=coarse,
         afar=Afar(far, scaled, effort),
+        by_mean_readings=by_mean_readings,
         guess=tuple(declared[name] for name in machine.parameters.names),
     )
     return search

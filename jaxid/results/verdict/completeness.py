@@ -37,8 +37,9 @@ _FEWEST = 20
 # Excess of the cumulated periodogram over a white one that counts, as a part of the power: on the fitted log,
 # and on others, whose residual also holds the error of the parameters.
 _EXCESS, _EXCESS_ELSEWHERE = 0.05, 0.1
-# Factor in RMS over the noise of an encoder beyond which its effect in a loop, half of it, decides nothing.
-_NEAR = 3.0
+# Factor in RMS over the noise of an encoder beyond which its effect in a loop decides nothing: of an arm half
+# of the noise, and of one joint, whose command the noise may drive into its limit.
+_NEAR, _NEAR_ALONE = 3.0, 20.0
 # Least periodograms in each value of the spectrum of drawn readings.
 _PERIODOGRAMS = 100
 # Probability that the periodogram of white noise exceeds the limit; there is one test for each joint and log.
@@ -69,6 +70,8 @@ class Residual:
         numerics: RMS that errors of filtering and integration may have [N or N m].
         reason: Reason why `complete` is None; empty if it is not.
         quantity: Quantity of the residual, "force" or "position"; its unit is that of rms and floor.
+        quiet: RMS of what the loop without noise leaves, where mean readings count in its place; NaN: they do
+            not.
     """
 
     log: str
@@ -82,6 +85,7 @@ class Residual:
     numerics: float = 0.0
     reason: str = ""
     quantity: str = "force"
+    quiet: float = np.nan
 
     @property
     def coloured(self) -> bool:
@@ -167,11 +171,11 @@ def _of_rows(machine: Machine, run: OpenedLog, gap: ForceGap, joint: int, *, fit
 
 
 def _noise_shows(machine: Machine, run: OpenedLog, gap: SimulationGap, floor: np.ndarray) -> bool:
-    """Check that noise in the loop, which moves a position by half of it, could decide a residual.
+    """Check that noise in the loop could decide a residual.
 
     Along an arm of many joints a run with each draw of noise takes minutes.
     """
-    near = gap.rms <= _NEAR * floor
+    near = gap.rms <= (_NEAR_ALONE if machine.gain.size == 1 else _NEAR) * floor
     return bool(np.any(near[list(run.log.measured)])) and machine.plant.filters_fast
 
 
@@ -208,7 +212,10 @@ def position_residuals(
         return found
     numerics = choose_numerics(machine, run.log)
     noisy = noisy_readings(machine, run.log, make_replay(machine, run.log, numerics))
-    return found if noisy is None else _positions_left(machine, run, *noisy, fitted=fitted)
+    if noisy is None:
+        return found
+    by_mean = _positions_left(machine, run, *noisy, fitted=fitted)
+    return [replace(mean, quiet=quiet.rms) for mean, quiet in zip(by_mean, found, strict=True)]
 
 
 def _positions_left(

@@ -28,6 +28,8 @@ from jaxid.session import OpenedLog, Session
 _OF_THE_ORDER = 0.5
 # Ratio of gap to noise beyond which the ratio says more than the colour.
 _CLEARLY = 1.3
+# Ratio of what a loop leaves without noise to what its mean readings leave from which a sentence names both.
+_MOVED = 2.0
 # A residual beyond this many times the measured force is stated without a number.
 _FAR = 10.0
 # A model that leaves this part of the force explains nothing: the log's columns are in doubt first.
@@ -287,7 +289,10 @@ def _completeness_words(
     """
     if complete:
         with_it = "With what was found the" if search == "found" else "The"
-        return [f"{with_it} model is complete for this log: what it leaves has the size and colour of noise."]
+        return [
+            f"{with_it} model is complete for this log: what it leaves has the size and colour of noise.",
+            *_noise_words(session, residuals),
+        ]
     if complete is None:
         reason = next((r.reason for r in residuals if r.complete is None), doubt)
         if not reason and search == "nothing_missing":
@@ -310,6 +315,20 @@ def _completeness_words(
     if search == "none" and not (machine.unforced(session.fit.log) and machine.plant.coupled):
         lines.append(_SEARCH)
     return lines
+
+
+def _noise_words(session: Session, residuals: Sequence[Residual]) -> list[str]:
+    """Return a sentence on the residual that noise in the loop moves most, if it moves one clearly."""
+    moved = [r for r in residuals if r.quiet > _MOVED * r.rms]
+    if not moved:
+        return []
+    r = max(moved, key=lambda r: r.quiet / r.rms)
+    scale, unit = scaled_unit(session.machine.unit(r.quantity, r.joint), [r.rms, r.quiet])
+    return [
+        f"The loop answers the noise of its encoder{_place(session, r.log, r.joint)}: simulated with this "
+        f"noise it leaves {plain(r.rms / scale)} {unit} of the position, and {plain(r.quiet / scale)} {unit} "
+        "without it, as in the table."
+    ]
 
 
 def _loop_words(session: Session) -> list[str]:
