@@ -284,13 +284,16 @@ def _estimate(
     moving = [replace(log, jacobian=log.jacobian[..., active]) for log in end.logs]
     values = np.concatenate([end.theta, end.starts])
     x, full = values[active], (yield from fit.hessian(end)) if hessian else None
-    precision = assess_together(names, moving, np.where(x != 0, x, 1.0), full, crossed=fit.on == "both")
-    if fit.unforced:
-        # Mean readings of a coarse encoder are off at its steps: the residual has no one size.
-        lengths = [len(log.residual) for log in moving]
-        precision = precision.widened(widening(precision, *stacked(moving), lengths))
+    # Derivatives of a simulation that diverged may be too large for their squares; the estimate says so.
+    how = "ignore" if end.diverged else "warn"
+    with np.errstate(over=how, invalid=how):
+        precision = assess_together(names, moving, np.where(x != 0, x, 1.0), full, crossed=fit.on == "both")
+        if fit.unforced:
+            # Mean readings of a coarse encoder are off at its steps: the residual has no one size.
+            lengths = [len(log.residual) for log in moving]
+            precision = precision.widened(widening(precision, *stacked(moving), lengths))
+        lasting = std_under_misspecification(*stacked(moving))[:p]
     precision = precision.first(machine.parameters.names)
-    lasting = std_under_misspecification(*stacked(moving))[:p]
 
     details: dict[str, Any] = {}
     remarks = list(hessian_notes(precision, hessian))

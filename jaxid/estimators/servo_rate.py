@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.consistency.absent import SLOW_LOOP
-from jaxid.consistency.hold import clearly_smaller
 from jaxid.estimators.estimate import INTERVAL, Estimate, misfit
+from jaxid.estimators.servo_law import leaves_clearly_less
 from jaxid.numerics.lanes import Steps
 
 if TYPE_CHECKING:
@@ -107,10 +107,7 @@ def _best(loops: list[_Loop]) -> _Loop | None:
 
 def _clearly_better(best: _Loop, other: _Loop) -> bool:
     """Check that a loop leaves clearly less of the log than another one."""
-    left, more = best.estimate.residual, other.estimate.residual
-    counts = np.isfinite(left) & np.isfinite(more)
-    scale = max(float(np.sqrt(np.mean(np.square(left[counts])))), 1e-300)
-    return clearly_smaller(np.where(counts, left, 0.0) / scale, np.where(counts, more, 0.0) / scale, counts)
+    return leaves_clearly_less(best.estimate, other.estimate)
 
 
 def _said(best: _Loop, equal: list[_Loop], loops: list[_Loop], period: float) -> Estimate:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from jaxid.estimators.effort import SCALE, Scale, scale_by_effort
 from jaxid.estimators.estimate import Estimate, misfit
 from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
+from jaxid.estimators.servo_law import leaves_law_open, with_law_of_log
 from jaxid.estimators.servo_rate import leaves_rate_open, with_rate_of_log
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
@@ -48,9 +50,10 @@ def unforced_steps(
 ) -> Steps[Estimate]:
     """Fit the positions of loops whose force was not logged, from several starts, to one log or to several.
 
-    An arm of servos starts from fits of each joint alone, see `jaxid.estimators.apart`. If the case states
-    the period of the loop, or if it is chosen (see `jaxid.estimators.servo_rate`), no delay has a smaller
-    standard deviation than that of a uniform error of one period.
+    An arm of servos starts from fits of each joint alone, see `jaxid.estimators.apart`. What the derivative
+    of the law acts on, and the rate of the loop, are chosen for another machine if the case does not state
+    them; see `jaxid.estimators.servo_law` and `jaxid.estimators.servo_rate`. If the period is stated or
+    chosen, no delay has a smaller standard deviation than that of a uniform error of one period.
 
     Args:
         session: Case and logs of the fit.
@@ -62,10 +65,15 @@ def unforced_steps(
     def fitted(session: Session) -> Steps[Estimate]:
         return (yield from _fitted_steps(session, numerics, scaled, **options))
 
-    own_rate = numerics is None and leaves_rate_open(session)
-    if own_rate and not stands_apart(session.machine, parts_of(session)):
-        return with_std_of_ticks((yield from with_rate_of_log(session, fitted)))
-    result = yield from fitted(session)
+    if stands_apart(session.machine, parts_of(session)):
+        result = yield from fitted(session)
+    else:
+        own_rate = numerics is None and leaves_rate_open(session)
+        at_rate = partial(with_rate_of_log, fitted=fitted) if own_rate else fitted
+        own_law = leaves_law_open(session)
+        result = yield from with_law_of_log(session, at_rate) if own_law else at_rate(session)
+        if own_rate:
+            return with_std_of_ticks(result)
     controller = session.case.controller
     stated = controller is not None and controller.period is not None
     return with_std_of_ticks(result) if stated else result

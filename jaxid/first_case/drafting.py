@@ -194,7 +194,6 @@ class Draft:
             "[controller]",
             {
                 "kind": "pd",
-                "derivative": "velocity",
                 "kp": {"guess": rounded(inertia * rate**2)},
                 "kd": {"guess": rounded(1.4 * inertia * rate)},
                 "delay": {"guess": 0.02},
@@ -202,7 +201,10 @@ class Draft:
             },
             {"delay": "s, between the command and the loop", "period": "s, of the servo's own loop"},
         )
-        loop.assumed.append("the law is kp (reference - position) - kd velocity")
+        loop.assumed.append(
+            "the law is kp times the error and kd times its derivative, or that of the position alone: "
+            "identify compares the two"
+        )
         loop.questions.append("at which rate does the servo's own loop run? Then period")
         return [
             plant,

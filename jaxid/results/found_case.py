@@ -19,6 +19,7 @@ from jaxid.case.case import Case, load_case
 from jaxid.case.declared import EffectEntry
 from jaxid.case.tables import UNKNOWN_OF_CONTROLLER, ControllerTable, at_start
 from jaxid.case.values import Value
+from jaxid.controllers import Controller
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
 from jaxid.files import write_whole
@@ -26,10 +27,13 @@ from jaxid.model.effect import Effect
 from jaxid.model.unknowns import CONTROLLER, REFERENCE, Free, several_places
 from jaxid.names import TEN
 from jaxid.plants.link_tree import LinkTree
+from jaxid.settings import LogTable
 
 if TYPE_CHECKING:
     from jaxid.results.result import FitResult
 
+# Settings of [controller] that a fit may choose.
+_CHOSEN = ("derivative", "period")
 # Digits of a guess: far more than any log determines, and few enough to read.
 _DIGITS = 9
 # Keys whose text is a file name relative to the case, and texts that name a class in such a file.
@@ -55,6 +59,8 @@ class Findings:
         controller: New guesses of [controller] by key and drive.
         added: Effects beside those of the case: the object, its place, and its values.
         stated: Values that effects beside those of the case have as keys of [controller], by key.
+        chosen: Settings of [controller] that the fit chose because the case leaves them out, by key.
+        hold: Course of the reference between two rows, if the fit chose one.
     """
 
     plant: dict[str, dict[Index, float]]
@@ -63,6 +69,8 @@ class Findings:
     controller: dict[str, dict[Index, float]]
     added: tuple[tuple[Effect, tuple[str, int] | None, dict[str, Value]], ...]
     stated: dict[str, Value | tuple[Value | float, ...]]
+    chosen: dict[str, Any]
+    hold: str | None
 
 
 def found_case(result: FitResult) -> Case:
@@ -96,20 +104,30 @@ def found_case(result: FitResult) -> Case:
         reference=reference,
         unknown_reference=unknown,
         controller=_with_controller(case, findings),
+        log=_log_with(case, findings),
     )
+
+
+def _log_with(case: Case, findings: Findings) -> LogTable | None:
+    """Return [log] with the course of the reference that the fit chose."""
+    if case.log is None or findings.hold is None:
+        return case.log
+    return replace(case.log, reference_hold=findings.hold)
 
 
 def _with_controller(case: Case, findings: Findings) -> ControllerTable | None:
     """Return [controller] with new guesses."""
     table = case.controller
-    if table is None or not (findings.controller or findings.stated):
+    if table is None or not (findings.controller or findings.stated or findings.chosen):
         return table
     unknown = {**table.unknown, **findings.stated}
     for name, guesses in findings.controller.items():
         for index, guess in guesses.items():
             unknown[name] = _with_guess(unknown[name], index, guess)
     law = {**table.law, **{name: at_start(value) for name, value in unknown.items()}}
-    return replace(table, law=law, unknown=unknown)
+    own = {key: value for key, value in findings.chosen.items() if key == "period"}
+    law |= {key: value for key, value in findings.chosen.items() if key not in own}
+    return replace(table, law=law, unknown=unknown, **own)
 
 
 def _findings(result: FitResult) -> Findings:
@@ -150,7 +168,24 @@ def _findings(result: FitResult) -> Findings:
         controller,
         tuple(_added(machine.plant, k, values) for k, values in added.items() if k not in keys),
         _stated(machine.plant, len(machine.gain), {k: (name, added[k]) for k, name in keys.items()}),
+        _chosen(result.session.machine.controller, machine.controller),
+        _hold(case, machine.reference_hold, result.session.machine.reference_hold),
     )
+
+
+def _hold(case: Case, fitted: str, declared: str) -> str | None:
+    """Return the course of the reference that a fit chose; None if it chose none, or the case states one."""
+    open_to_choice = case.log is not None and case.log.reference_hold is None
+    return fitted if open_to_choice and fitted != declared else None
+
+
+def _chosen(declared: Controller | None, fitted: Controller | None) -> dict[str, Any]:
+    """Return the settings of a control law that a fit chose in place of those of its case, by key."""
+    if declared is None or fitted is None:
+        return {}
+    pairs = {key: (getattr(declared, key, None), getattr(fitted, key, None)) for key in _CHOSEN}
+    changed = {key: new for key, (old, new) in pairs.items() if new != old}
+    return {key: _rounded(new) if isinstance(new, float) else new for key, new in changed.items()}
 
 
 def _stated(
@@ -310,6 +345,10 @@ def _put_guesses(tables: Any, case: Case, findings: Findings) -> None:
         tables["controller"] = copy.deepcopy(case.plant.defaults["controller"])
     for key, value in findings.stated.items():
         tables["controller"][key] = _inline(value)
+    for key, value in findings.chosen.items():
+        tables["controller"][key] = value
+    if findings.hold is not None and "log" in tables:
+        tables["log"]["reference_hold"] = findings.hold
     for key, guesses in findings.controller.items():
         assert case.controller is not None, "its unknowns are estimated"
         values = case.controller.unknown[key]

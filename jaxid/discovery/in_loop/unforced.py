@@ -104,7 +104,7 @@ def explored_from(
     progress("refitting in simulation")
     after = refitted(session, final, base) if effects else before
     if effects:
-        after = replace(after, notes=(*after.notes, _UNPROVEN))
+        after = replace(_with_choices(after, before), notes=(*after.notes, *_choices(before), _UNPROVEN))
 
     progress("simulating")
     old = gaps(before.machine, session.runs)
@@ -127,6 +127,24 @@ def explored_from(
         noise_floor=np.full(session.machine.plant.joints, np.nan),
         unseen=UNSEEN,
     )
+
+
+def _with_choices(after: Estimate, before: Estimate) -> Estimate:
+    """Return a refit with the settings that the fit of the declared model chose."""
+    chosen = before.details.get("settings", {})
+    return replace(
+        after, details={**after.details, "settings": {**after.details.get("settings", {}), **chosen}}
+    )
+
+
+def _choices(before: Estimate) -> list[str]:
+    """Return notes on the settings of the loop that the fit of the declared model chose."""
+    chosen = before.details.get("settings", {})
+    return [
+        f"{key} = {chosen[key]['value']} was chosen by the fit of the declared model: {chosen[key]['reason']}"
+        for key in ("derivative", "period")
+        if key in chosen
+    ]
 
 
 def _not_asked(session: Session) -> list[str]:

@@ -1,0 +1,111 @@
+"""Choice of the signal that a servo's derivative gain acts on, for logs without a force.
+
+Some servos differentiate the error of the position, others the position alone, which acts as viscous friction
+does. A law that is taken for the other one moves nearly alike with other gains, friction and delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxid.consistency.hold import clearly_smaller
+from jaxid.controllers.linear import PD
+from jaxid.estimators.estimate import Estimate
+from jaxid.model.unknowns import CONTROLLER
+from jaxid.numerics.lanes import Steps
+
+if TYPE_CHECKING:
+    from jaxid.session import Session
+
+# Standard deviations from zero beyond which the gain on the slope of the reference acts.
+_ACTS = 10.0
+
+
+def leaves_law_open(session: Session) -> bool:
+    """Check that a case does not state what the derivative of its PD law acts on."""
+    table = session.case.controller
+    return table is not None and "derivative" not in table.law and isinstance(session.machine.controller, PD)
+
+
+def with_law_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate]]) -> Steps[Estimate]:
+    """Fit a loop with a derivative of the error, and unless that acts clearly with one of the velocity.
+
+    Without its part of the reference, a derivative of the error is one of the velocity, and that is viscous
+    friction but for the ticks and the counts of the loop.
+
+    Args:
+        session: Case and logs; the case `leaves_law_open`.
+        fitted: Function that fits a session.
+
+    Returns:
+        The fit that leaves clearly less. If there is none, it is that of the velocity, and its 95 % intervals
+        hold the values of the other one too.
+    """
+    by_error = yield from fitted(session)
+    if by_error.converged and _derivative_acts(by_error):
+        return by_error
+
+    machine = session.machine
+    assert isinstance(machine.controller, PD), "asked of a PD law"
+    other = replace(machine, controller=replace(machine.controller, derivative="velocity"))
+    by_velocity = yield from fitted(session.with_machine(other))
+    if not by_velocity.converged:
+        return by_error
+
+    sizes = f"{_rms(by_error):.3g} with one of the error, {_rms(by_velocity):.3g} with one of the velocity"
+    reason = f"RMS that the fitted loops leave with a derivative: {sizes}"
+    if by_error.converged and leaves_clearly_less(by_error, by_velocity):
+        return _said(by_error, "error", reason)
+    if by_error.converged and not leaves_clearly_less(by_velocity, by_error):
+        # This fit does not tell its gain from viscous friction, and says so.
+        by_velocity = by_velocity.holding(by_error.theta)
+        reason += "; that is about equal, and the 95 % intervals hold the values of both"
+    return _said(by_velocity, "velocity", reason)
+
+
+def leaves_clearly_less(best: Estimate, other: Estimate) -> bool:
+    """Check that a fit leaves clearly less of the logs than another one."""
+    counts = np.isfinite(best.residual) & np.isfinite(other.residual)
+    scale = max(float(np.sqrt(np.mean(np.square(best.residual[counts])))), 1e-300)
+    less, more = (np.where(counts, e.residual, 0.0) / scale for e in (best, other))
+    return clearly_smaller(less, more, counts)
+
+
+def _derivative_acts(estimate: Estimate) -> bool:
+    """Check that the gain on the slope of the reference is unknown, and clearly not zero."""
+    relative = estimate.details.get("relative")
+    for k, unknown in enumerate(estimate.machine.parameters.free):
+        if unknown.path[:2] != (CONTROLLER, "kd"):
+            continue
+        value, std = estimate.theta[k], estimate.std[k]
+        if relative is not None and unknown.name in relative["values"]:
+            ratio = relative["values"][unknown.name]
+            value, std = ratio["value"], ratio["std"] or np.nan
+        if value > _ACTS * std:
+            return True
+    return False
+
+
+def _rms(estimate: Estimate) -> float:
+    return float(np.sqrt(np.nanmean(np.square(estimate.residual))))
+
+
+def _said(estimate: Estimate, derivative: str, reason: str) -> Estimate:
+    """Return a fit with the choice of its law among its settings and notes."""
+    note = (
+        f"the law of [controller] does not state its derivative: {derivative!r} is taken; {reason}; state "
+        "derivative if the servo's manual gives it"
+    )
+    settings = {"derivative": {"value": derivative, "reason": reason}}
+    return replace(
+        estimate,
+        notes=(*estimate.notes, note),
+        details={
+            **estimate.details,
+            "settings": {**estimate.details.get("settings", {}), **settings},
+        },
+    )
