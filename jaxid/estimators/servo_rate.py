@@ -42,8 +42,10 @@ class _Loop:
     course: str
     estimate: Estimate
 
-    def words(self, period: float) -> str:
-        """Return the loop in words, for a log of some period [s]."""
+    def words(self, period: float | None) -> str:
+        """Return the loop in words, for a log of some period [s]; None: its own period is stated."""
+        if period is None:
+            return f"{self.course} commands"
         size = f"{1e3 * period / self.ticks:.3g} ms"
         return size if self.ticks == 1 else f"{size} with {self.course} commands"
 
@@ -55,34 +57,50 @@ def leaves_rate_open(session: Session) -> bool:
     return unstated and not session.more and log.period > SLOW_LOOP
 
 
+def leaves_course_open(session: Session) -> bool:
+    """Check that a case states the period of a loop faster than its log, and not the command between rows."""
+    controller = session.case.controller
+    stated = controller is not None and controller.period is not None
+    return stated and not session.more and not _states_course(session) and _ticks(session) > 1
+
+
+def _ticks(session: Session) -> int:
+    """Return the ticks of the loop in a row of the log."""
+    assert session.machine.controller is not None, "asked of a servo"
+    return round(session.fit.log.period / session.machine.controller.period)
+
+
+def _states_course(session: Session) -> bool:
+    return "reference_hold" in session.case.tables.get("log", {})
+
+
 def with_rate_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate]]) -> Steps[Estimate]:
-    """Fit loops of several rates, and return the fit that explains the log.
+    """Fit loops of several rates and courses of the command, and return the fit that explains the log.
 
     Args:
-        session: Case and log; the case `leaves_rate_open`.
+        session: Case and log; the case `leaves_rate_open` or `leaves_course_open`.
         fitted: Function that fits a session.
 
     Returns:
         The fit that is clearly the best. If others explain the log about as well, the standard deviations are
         widened so that the 95 % intervals hold their values.
     """
-    stated = "reference_hold" in session.case.tables.get("log", {})
-    courses = (session.machine.reference_hold,) if stated else _COURSES
-    period = session.fit.log.period
+    courses = (session.machine.reference_hold,) if _states_course(session) else _COURSES
+    period, open_rate = session.fit.log.period, leaves_rate_open(session)
     loops: list[_Loop] = []
 
     def tried(ticks: int, course: str) -> Steps[None]:
-        if ticks > 1 and ticks / period > _FASTEST:
+        if open_rate and ticks > 1 and ticks / period > _FASTEST:
             return
         estimate = yield from fitted(_at(session, ticks, course))
         if estimate.converged:
             loops.append(_Loop(ticks, course, estimate))
 
-    for ticks in _FIRST:
+    for ticks in _FIRST if open_rate else (_ticks(session),):
         for course in courses if ticks > 1 else courses[:1]:
             yield from tried(ticks, course)
     best = _best(loops)
-    if best is not None and best.ticks > 1:
+    if open_rate and best is not None and best.ticks > 1:
         for ticks in _MORE:
             yield from tried(ticks, best.course)
         best = _best(loops)
@@ -90,14 +108,16 @@ def with_rate_of_log(session: Session, fitted: Callable[[Session], Steps[Estimat
         return (yield from fitted(session))
 
     equal = [loop for loop in loops if loop is not best and not _clearly_better(best, loop)]
-    return _said(best, equal, loops, period)
+    return _said(best, equal, loops, period if open_rate else None)
 
 
 def _at(session: Session, ticks: int, course: str) -> Session:
     """Return a session whose loop has some ticks in a row of the log."""
     machine = session.machine
     assert machine.controller is not None, "asked of a servo"
-    controller = replace(machine.controller, period=session.fit.log.period / ticks)
+    controller = machine.controller
+    if leaves_rate_open(session):
+        controller = replace(controller, period=session.fit.log.period / ticks)
     return session.with_machine(replace(machine, controller=controller, reference_hold=course))
 
 
@@ -110,8 +130,15 @@ def _clearly_better(best: _Loop, other: _Loop) -> bool:
     return leaves_clearly_less(best.estimate, other.estimate)
 
 
-def _said(best: _Loop, equal: list[_Loop], loops: list[_Loop], period: float) -> Estimate:
-    """Return the best fit with the choice among its settings and notes."""
+def _said(best: _Loop, equal: list[_Loop], loops: list[_Loop], period: float | None) -> Estimate:
+    """Return the best fit with the choice among its settings and notes.
+
+    Args:
+        best: The loop that is taken.
+        equal: Loops that explain the log about as well.
+        loops: All loops that were fitted.
+        period: Period of the log [s]; None: that of the loop is stated.
+    """
     estimate = best.estimate.holding(*(loop.estimate.theta for loop in equal))
     sizes = "; ".join(
         f"{loop.words(period)} {np.sqrt(np.nanmean(np.square(loop.estimate.residual))):.3g}"
@@ -121,10 +148,14 @@ def _said(best: _Loop, equal: list[_Loop], loops: list[_Loop], period: float) ->
     if equal:
         named = ", ".join(loop.words(period) for loop in (best, *equal))
         reason = f"{named} explain the log about equally well, and the 95 % intervals hold the values of all"
-    settings = {"period": {"value": f"{period / best.ticks:.6g} s", "reason": reason}}
+    settings, what = {}, "the course of the command between two rows"
+    if period is not None:
+        settings["period"] = {"value": f"{period / best.ticks:.6g} s", "reason": reason}
+        what = "the period of the servo's loop"
     if best.ticks > 1:
         settings["reference_hold"] = {"value": best.course, "reason": reason}
-    note = f"the period of the servo's loop is not stated: {best.words(period)} is taken; {reason}"
+    verb = "is" if period is not None else "are"
+    note = f"{what} is not stated: {best.words(period)} {verb} taken; {reason}"
     return replace(
         estimate,
         notes=(*estimate.notes, note),

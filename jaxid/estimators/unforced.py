@@ -24,7 +24,7 @@ from jaxid.estimators.estimate import Estimate, misfit
 from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.servo_law import leaves_law_open, with_law_of_log
-from jaxid.estimators.servo_rate import leaves_rate_open, with_rate_of_log
+from jaxid.estimators.servo_rate import leaves_course_open, leaves_rate_open, with_rate_of_log
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
 from jaxid.estimators.ticks import best_ticks, with_equal_ticks, with_std_of_ticks
@@ -68,7 +68,7 @@ def unforced_steps(
     if stands_apart(session.machine, parts_of(session)):
         result = yield from fitted(session)
     else:
-        own_rate = numerics is None and leaves_rate_open(session)
+        own_rate = numerics is None and (leaves_rate_open(session) or leaves_course_open(session))
         at_rate = partial(with_rate_of_log, fitted=fitted) if own_rate else fitted
         own_law = leaves_law_open(session)
         result = yield from with_law_of_log(session, at_rate) if own_law else at_rate(session)

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxid.case.robot import Robot
 from jaxid.case.urdf import Urdf
+from jaxid.consistency.absent import SLOW_LOOP
 from jaxid.first_case.balance import FreeSwing, RoughBalance, free_swing, rough_balance
 from jaxid.first_case.columns import NO_TIME_RATE, Chosen, Column
 from jaxid.first_case.joints import lacking_force
@@ -181,6 +182,7 @@ class Draft:
         log = self._read(table)
         plant = Section("[plant]", {"kind": "axis", "motion": self._measures.motion})
         plant.assumed.append("no force is logged: a position loop is taken to follow the reference")
+        self._label(plant)
         values = Section("[plant.parameters]", {"inertia": inertia}, {"inertia": units.label("inertia")})
         values.questions.append(
             "how large is the inertia that the joint moves? All forces and gains are in proportion to it"
@@ -190,22 +192,23 @@ class Draft:
             keys = {"kind": kind, key: {"guess": rounded(value)}}
             return Section("[[effects]]", keys, {key: units.label(dimension)})
 
-        loop = Section(
-            "[controller]",
-            {
-                "kind": "pd",
-                "kp": {"guess": rounded(inertia * rate**2)},
-                "kd": {"guess": rounded(1.4 * inertia * rate)},
-                "delay": {"guess": 0.02},
-                "period": rounded(log.period / max(round(log.period / _TICK), 1), 9),
-            },
-            {"delay": "s, between the command and the loop", "period": "s, of the servo's own loop"},
-        )
+        keys = {
+            "kind": "pd",
+            "kp": {"guess": rounded(inertia * rate**2)},
+            "kd": {"guess": rounded(1.4 * inertia * rate)},
+            "delay": {"guess": 0.02},
+        }
+        if log.period <= SLOW_LOOP:
+            keys["period"] = rounded(log.period / max(round(log.period / _TICK), 1), 9)
+        notes = {"delay": "s, between the command and the loop", "period": "s, of the servo's own loop"}
+        loop = Section("[controller]", keys, notes)
         loop.assumed.append(
             "the law is kp times the error and kd times its derivative, or that of the position alone: "
             "identify compares the two"
         )
-        loop.questions.append("at which rate does the servo's own loop run? Then period")
+        loop.questions.append(
+            "at which rate does the servo's own loop run? Then period; else identify finds it"
+        )
         return [
             plant,
             values,

@@ -81,6 +81,7 @@ class Log:
         steady: Precision of the rows of a table of steady speeds; None: the rows are samples over time.
         others: Stretches of rows of the same file that gaps separate from this one, first and end.
         clipped: Mask of the rows in which a force was larger than recorded, (samples, drives); None: none.
+        counted: Whether each position holds whole numbers only, before it was resampled; empty: as it is.
     """
 
     time: Column
@@ -102,6 +103,7 @@ class Log:
     steady: SteadyRows | None = None
     others: tuple[tuple[int, int], ...] = ()
     clipped: Bool[np.ndarray, "samples drives"] | None = None
+    counted: tuple[bool, ...] = ()
 
     def __post_init__(self):
         """Copy the arrays, make them read-only and check that they fit together.
@@ -381,6 +383,7 @@ def read_log(
     frame = Frame() if frame is None else frame
     groups, units = converted(groups, names, content.units, table, frame, str(path))
     groups, absent = _completed(groups, joints, drives)
+    counted = _counted(groups["position"]) if "position" in groups else ()
     time, groups, rows, timing, others = _at_one_rate(groups, table, rows, path)
     if time.size < MINIMUM_SAMPLES:
         raise _too_short(time.size, path)
@@ -393,8 +396,14 @@ def read_log(
         assumed=(*content.assumed, *absent, *units, *wraps, *timing),
         table=table,
         others=others,
+        counted=counted,
         **{"position": None, **groups},
     )
+
+
+def _counted(positions: Float[np.ndarray, "samples n"]) -> tuple[bool, ...]:
+    """Return whether each position holds whole numbers only; empty cells do not count."""
+    return tuple(bool(np.all((q == np.round(q)) | np.isnan(q))) for q in positions.T)
 
 
 def _completed(

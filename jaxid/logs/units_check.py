@@ -228,7 +228,8 @@ def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list
             continue
         where = f"{path}, position of joint {joint}"
         span = float(np.ptp(q))
-        if span >= 100 and np.all(q == np.round(q)):
+        counted = log.counted[joint - 1] if log.counted else bool(np.all(q == np.round(q)))
+        if span >= 100 and counted:
             what = f"position holds whole numbers only, {span:.0f} in all: encoder counts?"
             hint = (
                 'say units = { position = "count" } and counts_per_revolution in [log], '

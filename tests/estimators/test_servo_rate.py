@@ -53,11 +53,14 @@ class FakeFit:
 def chosen(monkeypatch):
     """The choice among fits whose residuals have given sizes."""
     case, log, _ = open_case(1)
-    session = open_session(case, log)
-    assert servo_rate.leaves_rate_open(session)
     monkeypatch.setattr(servo_rate, "misfit", lambda e: float(np.sum(e.residual**2)))
 
-    def choose(left, theta=lambda loop: 1.0):
+    def choose(left, theta=lambda loop: 1.0, period=None):
+        if period is not None:
+            case["controller"]["period"] = period
+        session = open_session(case, log)
+        assert servo_rate.leaves_rate_open(session) == (period is None)
+        assert servo_rate.leaves_course_open(session) == (period is not None)
         tried: list = []
         steps = servo_rate.with_rate_of_log(session, fits(left, tried, theta))
         with pytest.raises(StopIteration) as end:
@@ -108,9 +111,20 @@ def test_a_log_that_holds_every_tick_needs_no_faster_loop(chosen):
     assert {ticks for ticks, _ in tried} == {1, 10}
 
 
+def test_the_command_between_two_rows_is_found_where_the_period_is_stated(chosen):
+    found, tried = chosen({(4, "zero_order"): 1.0, (4, "band_limited"): 2.0}, period=5e-3)
+    assert tried == [(4, "zero_order"), (4, "band_limited")]
+    assert set(found.details["settings"]) == {"reference_hold"}
+    assert found.details["settings"]["reference_hold"]["value"] == "zero_order"
+    assert found.held == ()
+    assert "the course of the command between two rows is not stated: zero_order" in found.notes[-1]
+
+
 def test_a_stated_period_is_kept():
     drawn = servo(1)
-    assert not servo_rate.leaves_rate_open(open_session(drawn.case(), drawn.columns()))
+    session = open_session(drawn.case(), drawn.columns())
+    assert not servo_rate.leaves_rate_open(session)
+    assert not servo_rate.leaves_course_open(session)
 
 
 @pytest.mark.slow

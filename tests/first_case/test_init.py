@@ -301,6 +301,25 @@ def test_counts_that_start_anew_after_a_turn():
     assert jaxid.init(counts).tables["plant"]["units"]["position"] == "count"
 
 
+def test_a_servo_in_counts_has_a_case_that_is_checked_and_leaves_its_loop_open():
+    """The case stated the law and the rate that were assumed, and `check` refused its counts."""
+    time = 0.02 * np.arange(400)
+    goal = np.round(600 * np.sin(2 * time)) + 2048
+    servo = {"t": time, "goal_position": goal, "present_position": np.roll(goal, 2)}
+    first = jaxid.init(servo)
+    assert first.tables["plant"]["units"] == {"position": "count"}
+    assert not {"period", "derivative"} & set(first.tables["controller"])
+    assert "stroke 1200 count" in str(jaxid.check(first.tables, servo))
+
+    # Between uneven stamps they are no whole numbers any more.
+    uneven = servo | {"t": time + 1e-3 * np.random.default_rng(0).uniform(-1, 1, time.size)}
+    plant = {key: value for key, value in first.tables["plant"].items() if key != "units"}
+    plain = {**first.tables, "plant": plant}
+    for log in (servo, uneven):
+        with pytest.raises(InputError, match="position holds whole numbers only"):
+            jaxid.check(plain, log)
+
+
 def test_columns_that_only_their_unit_names():
     log = recorded()
     servo = {"t": log["t"], "goal_deg": np.degrees(log["ref"]), "present_deg": np.degrees(log["q"])}
