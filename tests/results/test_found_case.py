@@ -170,6 +170,7 @@ def test_lists_keep_their_form(tmp_path, style):
         class estimate:
             pass
 
+    Result.session.machine = machine
     Result.estimate.machine = machine.with_estimate(theta)
     Result.estimate.theta = theta
     Result.estimate.identifiable = np.array([name != "damping[1]" for name in names])
