@@ -16,13 +16,17 @@ from jaxid.consistency.hold import clearly_smaller
 from jaxid.controllers.linear import PD
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.unknowns import CONTROLLER
+from jaxid.names import LAW_DERIVATIVES
 from jaxid.numerics.lanes import Steps
+from jaxid.simulation.sensor_noise import position_noise
 
 if TYPE_CHECKING:
     from jaxid.session import Session
 
 # Standard deviations from zero beyond which the gain on the slope of the reference acts.
 _ACTS = 10.0
+# RMS that a fit leaves, over the noise of the readings, up to which a stated law is not questioned.
+_NEAR = 1.3
 
 
 def leaves_law_open(session: Session) -> bool:
@@ -65,6 +69,42 @@ def with_law_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate
         by_velocity = by_velocity.holding(by_error.theta)
         reason += "; that is about equal, and the 95 % intervals hold the values of both"
     return _said(by_velocity, "velocity", reason)
+
+
+def beside_other_law(
+    session: Session, fitted: Callable[[Session], Steps[Estimate]], estimate: Estimate
+) -> Steps[Estimate]:
+    """Return a fit with the law that explains the logs clearly better than the stated one, if there is one.
+
+    The other law is fitted only where the stated one leaves more than the noise of the readings. It is named
+    in `details["other_law"]`, and nothing else is changed.
+
+    Args:
+        session: Case and logs.
+        fitted: Function that fits a session.
+        estimate: The fit with the law of the case.
+    """
+    law = session.machine.controller
+    if not isinstance(law, PD) or leaves_law_open(session) or _near_noise(session, estimate):
+        return estimate
+    [name] = [n for n in LAW_DERIVATIVES if n != law.derivative]
+    other = replace(session.machine, controller=replace(law, derivative=name))
+    found = yield from fitted(session.with_machine(other))
+    if not found.converged or not leaves_clearly_less(found, estimate):
+        return estimate
+    clearly = {"derivative": name, "rms": _rms(found), "stated": law.derivative, "rms_stated": _rms(estimate)}
+    return replace(estimate, details={**estimate.details, "other_law": clearly})
+
+
+def _near_noise(session: Session, estimate: Estimate) -> bool:
+    """Check that a fit leaves about the noise of the readings of every log."""
+    ends = np.cumsum([run.log.samples for run in session.fits])[:-1]
+    for rows, run in zip(np.split(estimate.residual, ends), session.fits, strict=True):
+        floor = position_noise(run.machine(session.machine), run.log)
+        rms = np.sqrt(np.nanmean(np.square(rows), axis=0))
+        if np.any((rms > _NEAR * floor)[list(run.log.measured)]):
+            return False
+    return True
 
 
 def leaves_clearly_less(best: Estimate, other: Estimate) -> bool:

@@ -23,7 +23,7 @@ from jaxid.estimators.effort import SCALE, Scale, scale_by_effort
 from jaxid.estimators.estimate import Estimate, misfit
 from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
-from jaxid.estimators.servo_law import leaves_law_open, with_law_of_log
+from jaxid.estimators.servo_law import beside_other_law, leaves_law_open, with_law_of_log
 from jaxid.estimators.servo_rate import leaves_course_open, leaves_rate_open, with_rate_of_log
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.simulated_output import choose_numerics, position_jacobian
@@ -70,8 +70,11 @@ def unforced_steps(
     else:
         own_rate = numerics is None and (leaves_rate_open(session) or leaves_course_open(session))
         at_rate = partial(with_rate_of_log, fitted=fitted) if own_rate else fitted
-        own_law = leaves_law_open(session)
-        result = yield from with_law_of_log(session, at_rate) if own_law else at_rate(session)
+        if leaves_law_open(session):
+            result = yield from with_law_of_log(session, at_rate)
+        else:
+            result = yield from at_rate(session)
+            result = yield from beside_other_law(session, at_rate, result)
         if own_rate:
             return with_std_of_ticks(result)
     controller = session.case.controller

@@ -228,7 +228,9 @@ def magnitude_findings(log: Log, motion: str | Sequence[str], path: str) -> list
             continue
         where = f"{path}, position of joint {joint}"
         span = float(np.ptp(q))
-        counted = log.counted[joint - 1] if log.counted else bool(np.all(q == np.round(q)))
+        # A log that got columns for joints without an encoder is judged as it is.
+        read = len(log.counted) == log.position.shape[1]
+        counted = log.counted[joint - 1] if read else bool(np.all(q == np.round(q)))
         if span >= 100 and counted:
             what = f"position holds whole numbers only, {span:.0f} in all: encoder counts?"
             hint = (

@@ -102,3 +102,17 @@ def test_nothing_is_missing_whatever_the_derivative_acts_on(law):
     found = jaxid.discover(tomllib.loads(CASE), log(law, 0))
     assert found.verdict == "nothing_missing"
     assert found.model_complete is True
+
+
+@pytest.mark.slow
+def test_a_stated_law_that_the_log_contradicts_is_said_first():
+    """Its search names an effect that is not there, after a sentence on the law."""
+    stated = tomllib.loads(CASE.replace('kind = "pd"', 'kind = "pd"\nderivative = "velocity"'))
+    result = jaxid.identify(stated, log("error", 0))
+    assert result.model_complete is False
+    first = "With derivative = 'error' in place of the stated 'velocity' the fitted loop leaves"
+    assert result.findings[0].startswith(first)
+    found = jaxid.discover(stated, log("error", 0))
+    assert found.findings[0] == result.findings[0]
+    right = jaxid.identify(stated, log("velocity", 0))
+    assert not any("With derivative" in line for line in right.findings)

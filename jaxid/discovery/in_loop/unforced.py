@@ -130,11 +130,10 @@ def explored_from(
 
 
 def _with_choices(after: Estimate, before: Estimate) -> Estimate:
-    """Return a refit with the settings that the fit of the declared model chose."""
-    chosen = before.details.get("settings", {})
-    return replace(
-        after, details={**after.details, "settings": {**after.details.get("settings", {}), **chosen}}
-    )
+    """Return a refit with what the fit of the declared model chose, and with the law that it questions."""
+    settings = {**after.details.get("settings", {}), **before.details.get("settings", {})}
+    law = {key: before.details[key] for key in ("other_law",) if key in before.details}
+    return replace(after, details={**after.details, **law, "settings": settings})
 
 
 def _choices(before: Estimate) -> list[str]:

@@ -107,6 +107,7 @@ def judge(
     findings += _clipped_words(session, estimate)
     findings += [] if reading is None else reading.findings
     findings += [f"The fit contradicts the case: {r.text}." for r in contrary]
+    findings += _law_words(session, estimate)
     if against:
         findings.append(f"This model does not explain the log: {against[0]}")
         findings += [_capital(text) for text in against[1:]]
@@ -169,6 +170,19 @@ def _delay_words(estimate: Estimate) -> list[str]:
     return [
         f"The force seems to be logged {how}: that is too long to be taken for timing, and the values are "
         "those of the log as it is."
+    ]
+
+
+def _law_words(session: Session, estimate: Estimate) -> list[str]:
+    """Return a sentence on a control law that explains the logs clearly better than the stated one."""
+    other = estimate.details.get("other_law")
+    if other is None:
+        return []
+    scale, unit = scaled_unit(session.machine.unit("position"), [other["rms"], other["rms_stated"]])
+    less, more = (f"{plain(other[key] / scale)} {unit}" for key in ("rms", "rms_stated"))
+    return [
+        f"With derivative = '{other['derivative']}' in place of the stated '{other['stated']}' the fitted "
+        f"loop leaves {less} of the position, not {more}: check the law of the servo."
     ]
 
 
