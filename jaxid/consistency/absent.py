@@ -21,8 +21,6 @@ from jaxid.model.unknowns import Free, label
 _ROUNDING = 1e-9
 # Instants at which a machine is evaluated.
 _INSTANTS = 4
-# Period of a log without a force from which on it is probably not that of the servo's own loop [s].
-SLOW_LOOP = 2.5e-3
 # Methods that take a measured velocity as it is.
 BY_VELOCITY = ("inverse_dynamics", "prediction_error", "output_error", "power", "recursive")
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxid.consistency.absent import SLOW_LOOP
 from jaxid.estimators.estimate import INTERVAL, Estimate, misfit
 from jaxid.estimators.servo_law import leaves_clearly_less
+from jaxid.logs.log import SLOW_LOOP
 from jaxid.numerics.lanes import Steps
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ import numpy as np
 
 from jaxid.case.robot import Robot
 from jaxid.case.urdf import Urdf
-from jaxid.consistency.absent import SLOW_LOOP
 from jaxid.first_case.balance import FreeSwing, RoughBalance, free_swing, rough_balance
 from jaxid.first_case.columns import NO_TIME_RATE, Chosen, Column
 from jaxid.first_case.joints import lacking_force
@@ -20,7 +19,7 @@ from jaxid.first_case.raw import RawLog
 from jaxid.first_case.section import Section, rounded
 from jaxid.first_case.units import Measures
 from jaxid.logs.in_memory import LogLike, as_log
-from jaxid.logs.log import Log
+from jaxid.logs.log import SLOW_LOOP, Log
 from jaxid.logs.soundness import position_levels
 from jaxid.logs.units import Frame, parse_unit
 from jaxid.model.units import Units

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # Chosen: with fewer samples nothing remains after filtering and trimming.
 MINIMUM_SAMPLES = 50
+# Period of a log without a force from which on it is probably not that of the servo's own loop [s].
+SLOW_LOOP = 2.5e-3
 # Chosen, in any unit: beyond it a number is damaged, and its powers overflow.
 _LARGEST = 1e30
 # No shape here: columns may be flat, and `Log` checks their lengths.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from jaxid.case.case import Case
-from jaxid.consistency.absent import SLOW_LOOP, check_absent
-from jaxid.logs.log import Log
+from jaxid.consistency.absent import check_absent
+from jaxid.logs.log import SLOW_LOOP, Log
 from jaxid.logs.soundness import FEWEST_LEVELS, Finding, check_log, plausible_inertia, raise_on_error
 from jaxid.machine import Machine
 
