@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Standard deviations from zero beyond which the gain on the slope of the reference acts.
 _ACTS = 10.0
-# RMS that a fit leaves, over the noise of the readings, up to which a stated law is not questioned.
+# RMS that a fit leaves, over the noise of the readings, up to which it counts as noise.
 _NEAR = 1.3
 
 
@@ -46,8 +46,8 @@ def with_law_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate
         fitted: Function that fits a session.
 
     Returns:
-        The fit that leaves clearly less. If there is none, it is that of the velocity, and its 95 % intervals
-        hold the values of the other one too.
+        The fit of the error, if that of the velocity leaves more than noise; else the one that leaves clearly
+        less. If there is none, it is that of the velocity, whose 95 % intervals hold the other values too.
     """
     by_error = yield from fitted(session)
     if by_error.converged and _derivative_acts(by_error):
@@ -57,7 +57,8 @@ def with_law_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate
     assert isinstance(machine.controller, PD), "asked of a PD law"
     other = replace(machine, controller=replace(machine.controller, derivative="velocity"))
     by_velocity = yield from fitted(session.with_machine(other))
-    if not by_velocity.converged:
+    if not by_velocity.converged or not _near_noise(session, by_velocity):
+        # An incomplete model shows no law: it may lack what either of them would pass for.
         return by_error
 
     sizes = f"{_rms(by_error):.3g} with one of the error, {_rms(by_velocity):.3g} with one of the velocity"

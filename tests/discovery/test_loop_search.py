@@ -20,14 +20,20 @@ def noise(shift: float) -> ReadingNoise:
 
 
 @pytest.mark.parametrize(
-    ("shift", "nearer", "kept"), [(3e-4, False, True), (1.5e-2, False, False), (1.5e-2, True, True)]
+    ("shift", "nearer", "by_mean", "kept"),
+    [
+        (3e-4, False, False, True),
+        (1.5e-2, False, True, False),
+        (1.5e-2, True, False, False),
+        (1.5e-2, True, True, True),
+    ],
 )
-def test_an_unstable_loop_gives_other_models_no_mean_readings(shift, nearer, kept, monkeypatch):
+def test_an_unstable_loop_gives_other_models_no_mean_readings(shift, nearer, by_mean, kept, monkeypatch):
     monkeypatch.setattr(positions, "estimated_noise", lambda *args, **kwargs: noise(shift))
     monkeypatch.setattr(positions, "_nearer", lambda *args: nearer)
     monkeypatch.setattr(LoopSamples, "_alone", lambda self, superset, added, theta: (None, None))
     before = LoopSamples(None, None, None, (None, None), np.ones((5, 1), bool), np.ones((5, 1)), noise(1e-5))
-    after = before.renewed(None, (), np.zeros(1))
+    after = before.renewed(None, (), np.zeros(1), by_mean=by_mean)
     assert (after.noise is not None) == kept
 
 

@@ -132,7 +132,12 @@ class LoopSamples:
         )
 
     def renewed(
-        self, superset: cand.CandidateModel, added: Sequence[cand.Candidate], theta: np.ndarray
+        self,
+        superset: cand.CandidateModel,
+        added: Sequence[cand.Candidate],
+        theta: np.ndarray,
+        *,
+        by_mean: bool = False,
     ) -> LoopSamples:
         """Return the samples with the noise of the encoder as it is beside a model.
 
@@ -143,12 +148,13 @@ class LoopSamples:
             superset: The machine with all candidates.
             added: Effects of the model.
             theta: All unknowns of the superset.
+            by_mean: Whether these are of a fit of mean readings: then noise stays that brings them nearer.
         """
         machine, replay = self._alone(superset, added, theta)
         noise = estimated_noise(machine, self.log, replay, follows=False)
         if noise is None:
             return self
-        astray = _shaken(noise) and not _nearer(noise, machine, self.log, replay)
+        astray = _shaken(noise) and not (by_mean and _nearer(noise, machine, self.log, replay))
         return replace(self, noise=None if astray else noise)
 
     def drawn_noise(
@@ -510,17 +516,20 @@ class LoopSearch(Search):
                 theta = self.by_mean_readings(model)
                 if theta is not None:
                     model = replace(model, theta=theta)
-                    self._renew_noise(model)
+                    self._renew_noise(model, by_mean=True)
             model = replace(model, theta=self.fit(model.theta, index))
             if model.added:
                 model = replace(model, theta=self._at_other_delays(model.theta, index))
         return model
 
-    def _renew_noise(self, model: Model) -> None:
+    def _renew_noise(self, model: Model, *, by_mean: bool = False) -> None:
         """Estimate the noise of the encoder in the loops of all logs anew, beside a model."""
         renewed: list[Loops] = []
         for samples in self.logs:
-            parts = [part.renewed(self.superset, model.added, model.theta) for part in samples.parts]
+            parts = [
+                part.renewed(self.superset, model.added, model.theta, by_mean=by_mean)
+                for part in samples.parts
+            ]
             renewed.append(samples.with_parts(parts) if isinstance(samples, JoinedLoops) else parts[0])
         self.logs, self._drawn = tuple(renewed), {}
         self.samples, *others = self.logs
