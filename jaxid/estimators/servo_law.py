@@ -75,7 +75,7 @@ def with_law_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate
 def beside_other_law(
     session: Session, fitted: Callable[[Session], Steps[Estimate]], estimate: Estimate
 ) -> Steps[Estimate]:
-    """Return a fit with the law that explains the logs clearly better than the stated one, if there is one.
+    """Add to a fit the name of the other law, if that explains the logs clearly better than the stated one.
 
     The other law is fitted only where the stated one leaves more than the noise of the readings. It is named
     in `details["other_law"]`, and nothing else is changed.
