@@ -30,7 +30,7 @@ def drive_chain(session: Session, machine: Machine) -> tuple[ChainPart, ...]:
     declared = len(session.machine.plant.effects)
     marks = _marks(machine.plant, declared)
     parts = {
-        CONTROLLER: ("controller", _controller_lines(session)),
+        CONTROLLER: ("controller", _controller_lines(session, machine)),
         DRIVE: ("drive", _drive_lines(session)),
         GEAR: ("gear or belt", _gear_lines(machine.plant)),
         LOAD: ("load", _load_lines(session)),
@@ -44,11 +44,12 @@ def drive_chain(session: Session, machine: Machine) -> tuple[ChainPart, ...]:
     )
 
 
-def _controller_lines(session: Session) -> list[str]:
+def _controller_lines(session: Session, machine: Machine) -> list[str]:
     controller = session.case.controller
-    if controller is None or session.machine.controller is None:
+    if controller is None or machine.controller is None:
         return ["not in the case"]
-    return [controller.kind.replace("_", " "), f"{plain(1 / session.machine.controller.period, 4)} Hz"]
+    # The fit may have chosen the period.
+    return [controller.kind.replace("_", " "), f"{plain(1 / machine.controller.period, 4)} Hz"]
 
 
 def _drive_lines(session: Session) -> list[str]:
