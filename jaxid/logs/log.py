@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.errors import InputError, suggest
+from jaxid.logs.jitter import with_even_rows
 from jaxid.logs.late import taken_back
 from jaxid.logs.readers import read_table
 from jaxid.logs.readers.array_files import Columns
@@ -480,6 +481,9 @@ def _at_one_rate(
         stamps = column[:, 0]
         repeats = np.all([np.all(v[1:] == v[:-1], axis=1) for v in groups.values()], axis=0)
         base = time_base(stamps, rows[0], where, repeats)
+        motion = groups.get("position", groups.get("velocity"))
+        if not base.even and table.resample is None and motion is not None and np.isfinite(motion).all():
+            base = with_even_rows(base, base.of_samples(motion))
         _check_rate(base.time, table, where)
     first, end = base.rows
     kept = (rows[0] + first, rows[0] + end)

@@ -52,9 +52,10 @@ def sights_of(log: Log, findings: Sequence[Finding] = ()) -> list[Sight]:
 
 
 def _time(log: Log) -> Sight:
-    uneven = any(a.setting == "uneven_time" for a in log.assumed)
+    settings = {a.setting for a in log.assumed}
     how = "after resampling" if log.resampled else _EVEN
-    how = "with jitter" if uneven and not log.resampled else how
+    how = "with jitter" if "uneven_time" in settings and not log.resampled else how
+    how = "with rows taken as even" if "even_rows" in settings and not log.resampled else how
     return Sight(
         "time", f"{log.samples} samples, one every {_period(log.period)} ({log.rate_hz:.6g} Hz), {how}"
     )
@@ -98,6 +99,8 @@ def _sight(assumed: Assumed) -> Sight:
         about = "time" if quantity == "time" else "units"
         known = "not known" not in reason
         return Sight(about, f"{quantity} is in {value} ({reason})", say if known else "")
+    if setting == "even_rows":
+        return Sight("time", f"one row every {_period(1 / value)}, {value:g} {reason}", say)
     if setting == "resample":
         return Sight("time", f"resampled to {value:g} {reason}", say)
     if setting == "unwrap":

@@ -254,3 +254,43 @@ def test_a_disturbance_keeps_its_times_in_a_resampled_log(tmp_path):
     log = read_log(path, columns)
     assert log.samples == ROWS
     np.testing.assert_array_equal(disturbance_at("d", log.time, log)[:, 0], data["d"])
+
+
+def servo_in_counts(jitter: float, *, stamped_when_read: bool) -> dict:
+    """Return 1000 readings of 4096 counts a turn at 50 Hz, with the times that a host wrote down."""
+    grid = 0.02 * np.arange(1000)
+    late = jitter * np.random.default_rng(4).uniform(-1, 1, grid.size)
+    at = grid + late if stamped_when_read else grid
+    turns = 0.1 * np.sin(2 * np.pi * 0.5 * at) + 0.03 * np.sin(2 * np.pi * 1.7 * at)
+    return {"t": grid + late, "q": np.round(4096 * turns), "u": np.cos(at)}
+
+
+def test_rows_are_even_where_readings_do_not_follow_the_jitter_of_their_stamps():
+    data = servo_in_counts(1e-3, stamped_when_read=False)
+    log = as_log(data, COLUMNS)
+    np.testing.assert_array_equal(log.position[:, 0], data["q"])
+    assert log.period == pytest.approx(0.02, rel=1e-5)
+    assert "resample" not in words(log)
+    assert "follow -0.0" in words(log)["even_rows"].reason or "follow 0.0" in words(log)["even_rows"].reason
+
+
+def test_rows_go_by_their_stamps_where_readings_follow_the_jitter_or_show_nothing():
+    data = servo_in_counts(1e-3, stamped_when_read=True)
+    assert "even_rows" not in words(as_log(data, COLUMNS))
+    data = servo_in_counts(1e-3, stamped_when_read=False)
+    data["q"] = np.round(data["q"] / 100)
+    assert "even_rows" not in words(as_log(data, COLUMNS))
+
+
+def test_a_stated_rate_goes_by_the_stamps():
+    data = servo_in_counts(1e-3, stamped_when_read=False)
+    assert "even_rows" not in words(as_log(data, {**COLUMNS, "resample": 50.0}))
+
+
+def test_missing_samples_of_even_rows_are_filled_on_their_grid():
+    data = servo_in_counts(1e-3, stamped_when_read=False)
+    lost = [200, 201, 500]
+    log = as_log({name: np.delete(column, lost) for name, column in data.items()}, COLUMNS)
+    assert log.samples == 1000
+    there = np.delete(np.arange(1000), [*lost])
+    np.testing.assert_allclose(log.position[there, 0], data["q"][there], atol=0.1)
