@@ -6,15 +6,14 @@ does. A law that is taken for the other one moves nearly alike with other gains,
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from jaxid.consistency.hold import clearly_smaller
 from jaxid.controllers.linear import PD
-from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.estimate import Estimate, misfit
 from jaxid.model.unknowns import CONTROLLER
 from jaxid.names import LAW_DERIVATIVES
 from jaxid.numerics.lanes import Steps
@@ -25,8 +24,17 @@ if TYPE_CHECKING:
 
 # Standard deviations from zero beyond which the gain on the slope of the reference acts.
 _ACTS = 10.0
-# RMS that a fit leaves, over the noise of the readings, up to which it counts as noise.
-_NEAR = 1.3
+# RMS that a fit leaves, over the noise of the readings, up to which it counts as noise; and beyond which the
+# model is incomplete.
+_NEAR, _FAR = 1.3, 2.0
+
+
+class Fitted(Protocol):
+    """A function that fits a session, with the noise of the encoder in the loop or without."""
+
+    def __call__(self, session: Session, *, without_noise: bool = False) -> Steps[Estimate]:
+        """Fit a session."""
+        ...
 
 
 def leaves_law_open(session: Session) -> bool:
@@ -35,7 +43,7 @@ def leaves_law_open(session: Session) -> bool:
     return table is not None and "derivative" not in table.law and isinstance(session.machine.controller, PD)
 
 
-def with_law_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate]]) -> Steps[Estimate]:
+def with_law_of_log(session: Session, fitted: Fitted) -> Steps[Estimate]:
     """Fit a loop with a derivative of the error, and unless that acts clearly with one of the velocity.
 
     Without its part of the reference, a derivative of the error is one of the velocity, and that is viscous
@@ -56,6 +64,11 @@ def with_law_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate
     machine = session.machine
     assert isinstance(machine.controller, PD), "asked of a PD law"
     other = replace(machine, controller=replace(machine.controller, derivative="velocity"))
+    if leaves_far_more_than_noise(session, by_error):
+        # A fit with noise takes ten times as long, and this law may be no better.
+        plain = yield from fitted(session.with_machine(other), without_noise=True)
+        if not plain.converged or misfit(plain) > misfit(by_error):
+            return by_error
     by_velocity = yield from fitted(session.with_machine(other))
     if not by_velocity.converged or not _near_noise(session, by_velocity):
         # An incomplete model shows no law: it may lack what either of them would pass for.
@@ -72,9 +85,7 @@ def with_law_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate
     return _said(by_velocity, "velocity", reason)
 
 
-def beside_other_law(
-    session: Session, fitted: Callable[[Session], Steps[Estimate]], estimate: Estimate
-) -> Steps[Estimate]:
+def beside_other_law(session: Session, fitted: Fitted, estimate: Estimate) -> Steps[Estimate]:
     """Add to a fit the name of the other law, if that explains the logs clearly better than the stated one.
 
     The other law is fitted only where the stated one leaves more than the noise of the readings. It is named
@@ -97,15 +108,25 @@ def beside_other_law(
     return replace(estimate, details={**estimate.details, "other_law": clearly})
 
 
+def leaves_far_more_than_noise(session: Session, estimate: Estimate) -> bool:
+    """Check that a fit leaves far more than the noise of the readings of a log: its model is incomplete."""
+    return _over_noise(session, estimate) > _FAR
+
+
 def _near_noise(session: Session, estimate: Estimate) -> bool:
     """Check that a fit leaves about the noise of the readings of every log."""
+    return _over_noise(session, estimate) <= _NEAR
+
+
+def _over_noise(session: Session, estimate: Estimate) -> float:
+    """Return the largest RMS that a fit leaves of a measured position, over the noise of its readings."""
     ends = np.cumsum([run.log.samples for run in session.fits])[:-1]
+    largest = 0.0
     for rows, run in zip(np.split(estimate.residual, ends), session.fits, strict=True):
-        floor = position_noise(run.machine(session.machine), run.log)
+        floor = np.maximum(position_noise(run.machine(session.machine), run.log), 1e-300)
         rms = np.sqrt(np.nanmean(np.square(rows), axis=0))
-        if np.any((rms > _NEAR * floor)[list(run.log.measured)]):
-            return False
-    return True
+        largest = max(largest, float(np.max((rms / floor)[list(run.log.measured)])))
+    return largest
 
 
 def leaves_clearly_less(best: Estimate, other: Estimate) -> bool:

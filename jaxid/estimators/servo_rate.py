@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxid.estimators.estimate import INTERVAL, Estimate, misfit
-from jaxid.estimators.servo_law import leaves_clearly_less
+from jaxid.estimators.servo_law import leaves_clearly_less, leaves_far_more_than_noise
 from jaxid.logs.log import SLOW_LOOP
 from jaxid.numerics.lanes import Steps
 
@@ -26,6 +27,8 @@ _FIRST, _MORE = (1, 10), (5, 4, 2, 20)
 _COURSES = ("zero_order", "band_limited")
 # Most ticks a second.
 _FASTEST = 4000.0
+# RMS that a loop leaves without noise, over that of the best one, up to which it may be the best with noise.
+_MAY_BE_BEST = 1.4
 
 
 @dataclass(frozen=True)
@@ -74,17 +77,43 @@ def _states_course(session: Session) -> bool:
     return "reference_hold" in session.case.tables.get("log", {})
 
 
-def with_rate_of_log(session: Session, fitted: Callable[[Session], Steps[Estimate]]) -> Steps[Estimate]:
+def with_rate_of_log(session: Session, fitted: Fitted, *, without_noise: bool = False) -> Steps[Estimate]:
     """Fit loops of several rates and courses of the command, and return the fit that explains the log.
+
+    They are fitted without noise first, and the best of them as usual. If that leaves far more than noise,
+    the model is incomplete and shows no rate: the others are not fitted with noise.
 
     Args:
         session: Case and log; the case `leaves_rate_open` or `leaves_course_open`.
         fitted: Function that fits a session.
+        without_noise: Whether no loop is fitted with the noise of its encoder.
 
     Returns:
         The fit that is clearly the best. If others explain the log about as well, the standard deviations are
         widened so that the 95 % intervals hold their values.
     """
+    plain = yield from _loops(session, partial(fitted, without_noise=True))
+    best = _best(plain)
+    if best is None:
+        return (yield from fitted(session, without_noise=without_noise))
+    if without_noise:
+        return _said(session, best, _equal(best, plain), plain)
+
+    at_best = yield from fitted(_at(session, best.ticks, best.course))
+    if not at_best.converged or leaves_far_more_than_noise(session, at_best):
+        return _said(session, replace(best, estimate=at_best), _equal(best, plain), plain)
+
+    loops = [replace(best, estimate=at_best)]
+    for loop in plain:
+        if loop is not best and misfit(loop.estimate) <= _MAY_BE_BEST**2 * misfit(best.estimate):
+            estimate = yield from fitted(_at(session, loop.ticks, loop.course))
+            loops += [replace(loop, estimate=estimate)] if estimate.converged else []
+    best = min(loops, key=lambda loop: misfit(loop.estimate))
+    return _said(session, best, _equal(best, loops), loops)
+
+
+def _loops(session: Session, fitted: Callable[[Session], Steps[Estimate]]) -> Steps[list[_Loop]]:
+    """Return the loops of all rates and courses that converge."""
     courses = (session.machine.reference_hold,) if _states_course(session) else _COURSES
     period, open_rate = session.fit.log.period, leaves_rate_open(session)
     loops: list[_Loop] = []
@@ -103,12 +132,7 @@ def with_rate_of_log(session: Session, fitted: Callable[[Session], Steps[Estimat
     if open_rate and best is not None and best.ticks > 1:
         for ticks in _MORE:
             yield from tried(ticks, best.course)
-        best = _best(loops)
-    if best is None:
-        return (yield from fitted(session))
-
-    equal = [loop for loop in loops if loop is not best and not _clearly_better(best, loop)]
-    return _said(best, equal, loops, period if open_rate else None)
+    return loops
 
 
 def _at(session: Session, ticks: int, course: str) -> Session:
@@ -125,20 +149,23 @@ def _best(loops: list[_Loop]) -> _Loop | None:
     return min(loops, key=lambda loop: misfit(loop.estimate), default=None)
 
 
-def _clearly_better(best: _Loop, other: _Loop) -> bool:
-    """Check that a loop leaves clearly less of the log than another one."""
-    return leaves_clearly_less(best.estimate, other.estimate)
+def _equal(best: _Loop, loops: list[_Loop]) -> list[_Loop]:
+    """Return the other loops that do not leave clearly more of the log than the best."""
+    return [
+        loop for loop in loops if loop is not best and not leaves_clearly_less(best.estimate, loop.estimate)
+    ]
 
 
-def _said(best: _Loop, equal: list[_Loop], loops: list[_Loop], period: float | None) -> Estimate:
+def _said(session: Session, best: _Loop, equal: list[_Loop], loops: list[_Loop]) -> Estimate:
     """Return the best fit with the choice among its settings and notes.
 
     Args:
+        session: Case and log.
         best: The loop that is taken.
         equal: Loops that explain the log about as well.
         loops: All loops that were fitted.
-        period: Period of the log [s]; None: that of the loop is stated.
     """
+    period = session.fit.log.period if leaves_rate_open(session) else None
     estimate = best.estimate.holding(*(loop.estimate.theta for loop in equal))
     sizes = "; ".join(
         f"{loop.words(period)} {np.sqrt(np.nanmean(np.square(loop.estimate.residual))):.3g}"

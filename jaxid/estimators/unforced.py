@@ -62,8 +62,8 @@ def unforced_steps(
         options: Further arguments of `output_error_steps`.
     """
 
-    def fitted(session: Session) -> Steps[Estimate]:
-        return (yield from _fitted_steps(session, numerics, scaled, **options))
+    def fitted(session: Session, *, without_noise: bool = False) -> Steps[Estimate]:
+        return (yield from _fitted_steps(session, numerics, scaled, without_noise, **options))
 
     if stands_apart(session.machine, parts_of(session)):
         result = yield from fitted(session)
@@ -83,9 +83,9 @@ def unforced_steps(
 
 
 def _fitted_steps(
-    session: Session, numerics: Numerics | None, scaled: bool, **options: Any
+    session: Session, numerics: Numerics | None, scaled: bool, without_noise: bool, **options: Any
 ) -> Steps[Estimate]:
-    """Fit as `unforced_steps` does, for its arguments."""
+    """Fit as `unforced_steps` does; `without_noise`: one run of the loop without noise, which is faster."""
     machine = session.machine
     if stands_apart(machine, parts_of(session)):
         return (yield from arm_steps(machine, parts_of(session), numerics=numerics, **options))
@@ -104,7 +104,7 @@ def _fitted_steps(
     for start in starts:
         fits.append((yield from fit(fitted, parts, start=start, numerics=numerics, **options)))
     result = min(fits, key=lambda e: (not e.converged, misfit(e)))
-    if result.converged and by_joints is None:
+    if result.converged and by_joints is None and not without_noise:
         result = yield from _by_mean_readings(fitted, parts, result, numerics=numerics, **options)
     if base is None:
         return result

@@ -22,10 +22,10 @@ def open_case(seed: int) -> tuple[dict, dict, object]:
 def fits(left: dict, tried: list, theta=lambda loop: 1.0):
     """A fit whose residual has a size by loop, and the loops that were fitted."""
 
-    def fitted(session):
+    def fitted(session, *, without_noise=False):
         machine = session.machine
         loop = (round(session.fit.log.period / machine.controller.period), machine.reference_hold)
-        tried.append(loop)
+        tried.append((*loop, without_noise))
         rng = np.random.default_rng(len(tried))
         estimate = FakeFit(np.array([theta(loop)]), left.get(loop, 5.0) * rng.standard_normal((600, 1)))
         return estimate
@@ -55,7 +55,8 @@ def chosen(monkeypatch):
     case, log, _ = open_case(1)
     monkeypatch.setattr(servo_rate, "misfit", lambda e: float(np.sum(e.residual**2)))
 
-    def choose(left, theta=lambda loop: 1.0, period=None):
+    def choose(left, theta=lambda loop: 1.0, period=None, incomplete=False):
+        monkeypatch.setattr(servo_rate, "leaves_far_more_than_noise", lambda *a: incomplete)
         if period is not None:
             case["controller"]["period"] = period
         session = open_session(case, log)
@@ -71,11 +72,13 @@ def chosen(monkeypatch):
 
 
 def test_the_loop_that_leaves_clearly_least_is_taken(chosen):
-    found, tried = chosen({(4, "zero_order"): 1.0, (10, "zero_order"): 2.0})
+    found, tried = chosen({(4, "zero_order"): 1.0, (5, "zero_order"): 1.3, (10, "zero_order"): 2.0})
     assert found.details["settings"]["period"]["value"] == "0.005 s"
     assert found.details["settings"]["reference_hold"]["value"] == "zero_order"
     assert found.held == ()
-    assert len(tried) == len(set(tried)) == 7
+    assert len(tried) == len(set(tried)) == 9
+    # Loops that leave far more without noise are not fitted with it.
+    assert {tuple(loop) for *loop, plain in tried if not plain} == {(4, "zero_order"), (5, "zero_order")}
 
 
 def test_loops_that_leave_as_little_widen_the_intervals(chosen):
@@ -85,6 +88,13 @@ def test_loops_that_leave_as_little_widen_the_intervals(chosen):
     )
     assert found.held == (10.0,) or found.held == (4.0,)
     assert "about equally well" in found.notes[-1]
+
+
+def test_an_incomplete_model_is_fitted_with_noise_once(chosen):
+    left = {(4, "zero_order"): 1.0, (5, "zero_order"): 1.01, (10, "zero_order"): 2.0}
+    found, tried = chosen(left, theta=lambda loop: loop[0], incomplete=True)
+    assert [plain for *_, plain in tried].count(False) == 1
+    assert found.held == (5.0,) or found.held == (4.0,)
 
 
 def test_ratios_to_a_base_are_widened_too():
@@ -108,12 +118,12 @@ def test_a_log_that_holds_every_tick_needs_no_faster_loop(chosen):
     found, tried = chosen({(1, "zero_order"): 1.0, (1, "band_limited"): 1.0})
     assert found.details["settings"]["period"]["value"] == "0.02 s"
     assert "reference_hold" not in found.details["settings"]
-    assert {ticks for ticks, _ in tried} == {1, 10}
+    assert {ticks for ticks, _, _ in tried} == {1, 10}
 
 
 def test_the_command_between_two_rows_is_found_where_the_period_is_stated(chosen):
     found, tried = chosen({(4, "zero_order"): 1.0, (4, "band_limited"): 2.0}, period=5e-3)
-    assert tried == [(4, "zero_order"), (4, "band_limited")]
+    assert tried == [(4, "zero_order", True), (4, "band_limited", True), (4, "zero_order", False)]
     assert set(found.details["settings"]) == {"reference_hold"}
     assert found.details["settings"]["reference_hold"]["value"] == "zero_order"
     assert found.held == ()
