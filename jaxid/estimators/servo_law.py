@@ -57,13 +57,14 @@ def with_law_of_log(session: Session, fitted: Fitted) -> Steps[Estimate]:
         The fit of the error, if that of the velocity leaves more than noise; else the one that leaves clearly
         less. If there is none, it is that of the velocity, whose 95 % intervals hold the other values too.
     """
-    by_error = yield from fitted(session)
+    machine = session.machine
+    assert isinstance(machine.controller, PD), "asked of a PD law"
+    law = machine.controller
+    first, other = (replace(machine, controller=replace(law, derivative=name)) for name in LAW_DERIVATIVES)
+    by_error = yield from fitted(session.with_machine(first))
     if by_error.converged and _derivative_acts(by_error):
         return by_error
 
-    machine = session.machine
-    assert isinstance(machine.controller, PD), "asked of a PD law"
-    other = replace(machine, controller=replace(machine.controller, derivative="velocity"))
     if leaves_far_more_than_noise(session, by_error):
         # A fit with noise takes ten times as long, and this law may be no better.
         plain = yield from fitted(session.with_machine(other), without_noise=True)

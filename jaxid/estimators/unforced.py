@@ -82,6 +82,18 @@ def unforced_steps(
     return with_std_of_ticks(result) if stated else result
 
 
+def leaves_loop_open(session: Session) -> bool:
+    """Check that a fit of one servo chooses its law, its rate, or its command between two rows."""
+    if stands_apart(session.machine, parts_of(session)):
+        return False
+    return leaves_law_open(session) or leaves_rate_open(session) or leaves_course_open(session)
+
+
+def at_its_loop_steps(session: Session) -> Steps[Estimate]:
+    """Fit one servo with the law, the rate and the command of its machine, whatever the case leaves open."""
+    return with_std_of_ticks((yield from _fitted_steps(session, None, False, False)))
+
+
 def _fitted_steps(
     session: Session, numerics: Numerics | None, scaled: bool, without_noise: bool, **options: Any
 ) -> Steps[Estimate]:

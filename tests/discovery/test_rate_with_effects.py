@@ -1,0 +1,57 @@
+"""The rate of a servo's loop in a search, which a model without the hidden effect does not show."""
+
+import numpy as np
+import pytest
+
+import jaxid
+from benchmarks.unforced_machines import Servo
+
+RATE, EVERY, SECONDS = 1000.0, 20, 12.0
+COUNT = 2 * np.pi / 4096
+TRUE = {
+    "viscous_friction.coefficient": 0.02,
+    "coulomb_friction.level": 0.12,
+    "controller.kp": 6.0,
+    "controller.kd": 0.12,
+    "controller.delay": 0.024,
+    "stribeck_friction.level": 0.1,
+    "stribeck_friction.velocity": 0.2,
+}
+CASE = {
+    "plant": {"kind": "axis", "motion": "rotary", "parameters": {"inertia": 4e-3}},
+    "effects": [
+        {"kind": "viscous_friction", "coefficient": {"guess": 0.05}},
+        {"kind": "coulomb_friction", "level": {"guess": 0.05}},
+    ],
+    "controller": {"kind": "pd", "kp": {"guess": 3.0}, "kd": {"guess": 0.3}, "delay": {"guess": 0.01}},
+    "sensor": {"position_resolution": COUNT, "position_noise": 0.0},
+    "log": {"time": "t", "position": "q", "reference": "r"},
+}
+
+
+@pytest.mark.slow
+def test_the_rate_is_chosen_again_with_what_was_found():
+    """It stayed 5 ms for 1 ms, that of the incomplete model: friction and gain were 4 to 5 sigma off."""
+    t = np.arange(0, SECONDS, EVERY / RATE)
+    waves = [(0.6, 0.31, 0), (0.35, 0.83, 1), (0.15, 1.7, 0)]
+    command = np.clip(t, 0, 1) * sum(a * np.sin(2 * np.pi * f * t + p) for a, f, p in waves)
+    command = np.round(command / COUNT) * COUNT
+    effects = {
+        "viscous_friction": {"coefficient": TRUE["viscous_friction.coefficient"]},
+        "coulomb_friction": {"level": TRUE["coulomb_friction.level"]},
+        "stribeck_friction": {
+            "level": TRUE["stribeck_friction.level"],
+            "velocity": TRUE["stribeck_friction.velocity"],
+        },
+        "command_delay": {"delay": TRUE["controller.delay"]},
+    }
+    log = Servo(1, RATE, EVERY, 4e-3, TRUE["controller.kp"], TRUE["controller.kd"], effects, command).run()
+    position = np.round(log["position"].ravel() / COUNT) * COUNT
+
+    found = jaxid.discover(CASE, {"t": t, "q": position, "r": command})
+    assert [effect.kind for effect in found.effects] == ["stribeck_friction"]
+    assert found.model_complete is True
+    assert float(found.settings["period"]["value"].split()[0]) <= 2.01 / RATE
+    for name, true in TRUE.items():
+        value = found.parameters[name]
+        assert abs(value.value - true) < 3.5 * value.std, name
