@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 _FIRST, _MORE = (1, 10), (5, 4, 2, 20)
 # Courses of the command between two rows that are tried.
 _COURSES = ("zero_order", "band_limited")
+# Part by which the periods of logs that are fitted together may differ.
+_SAME = 1e-4
 # Most ticks a second.
 _FASTEST = 4000.0
 # RMS that a loop leaves without noise, over that of the best one, up to which it may be the best with noise.
@@ -45,6 +47,11 @@ class _Loop:
     course: str
     estimate: Estimate
 
+    @property
+    def rms(self) -> float:
+        """RMS of the position that it leaves [m or rad]."""
+        return float(np.sqrt(np.nanmean(np.square(self.estimate.residual))))
+
     def words(self, period: float | None) -> str:
         """Return the loop in words, for a log of some period [s]; None: its own period is stated."""
         if period is None:
@@ -54,17 +61,23 @@ class _Loop:
 
 
 def leaves_rate_open(session: Session) -> bool:
-    """Check that a case does not state the period of a servo's loop, and that the log is slower than most."""
+    """Check that a case does not state the period of its servos' loop, and that its logs are slow."""
     controller, log = session.case.controller, session.fit.log
     unstated = controller is not None and controller.period is None
-    return unstated and not session.more and log.period > SLOW_LOOP
+    return unstated and _one_period(session) and log.period > SLOW_LOOP
 
 
 def leaves_course_open(session: Session) -> bool:
     """Check that a case states the period of a loop faster than its log, and not the command between rows."""
     controller = session.case.controller
     stated = controller is not None and controller.period is not None
-    return stated and not session.more and not _states_course(session) and _ticks(session) > 1
+    return stated and _one_period(session) and not _states_course(session) and _ticks(session) > 1
+
+
+def _one_period(session: Session) -> bool:
+    """Check that all logs have the same period, so that a loop has the same ticks in a row of each."""
+    first = session.fit.log.period
+    return all(abs(run.log.period / first - 1) < _SAME for run in session.more)
 
 
 def _ticks(session: Session) -> int:
@@ -105,11 +118,13 @@ def with_rate_of_log(session: Session, fitted: Fitted, *, without_noise: bool = 
 
     loops = [replace(best, estimate=at_best)]
     for loop in plain:
-        if loop is not best and misfit(loop.estimate) <= _MAY_BE_BEST**2 * misfit(best.estimate):
+        if loop is not best and loop.rms <= _MAY_BE_BEST * best.rms:
             estimate = yield from fitted(_at(session, loop.ticks, loop.course))
             loops += [replace(loop, estimate=estimate)] if estimate.converged else []
     best = min(loops, key=lambda loop: misfit(loop.estimate))
-    return _said(session, best, _equal(best, loops), loops)
+    done = {(loop.ticks, loop.course) for loop in loops}
+    others = [loop for loop in plain if (loop.ticks, loop.course) not in done]
+    return _said(session, best, _equal(best, loops), [*loops, *others])
 
 
 def _loops(session: Session, fitted: Callable[[Session], Steps[Estimate]]) -> Steps[list[_Loop]]:
@@ -168,8 +183,7 @@ def _said(session: Session, best: _Loop, equal: list[_Loop], loops: list[_Loop])
     period = session.fit.log.period if leaves_rate_open(session) else None
     estimate = best.estimate.holding(*(loop.estimate.theta for loop in equal))
     sizes = "; ".join(
-        f"{loop.words(period)} {np.sqrt(np.nanmean(np.square(loop.estimate.residual))):.3g}"
-        for loop in sorted(loops, key=lambda loop: misfit(loop.estimate))
+        f"{loop.words(period)} {loop.rms:.3g}" for loop in sorted(loops, key=lambda loop: loop.rms)
     )
     reason = f"RMS that the fitted loops leave: {sizes}"
     if equal:

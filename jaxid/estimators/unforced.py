@@ -46,61 +46,68 @@ _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
 
 
 def unforced_steps(
-    session: Session, *, numerics: Numerics | None = None, scaled: bool = False, **options: Any
+    session: Session,
+    *,
+    numerics: Numerics | None = None,
+    scaled: bool = False,
+    near: bool = False,
+    **options: Any,
 ) -> Steps[Estimate]:
     """Fit the positions of loops whose force was not logged, from several starts, to one log or to several.
 
     An arm of servos starts from fits of each joint alone, see `jaxid.estimators.apart`. What the derivative
-    of the law acts on, and the rate of the loop, are chosen for another machine if the case does not state
-    them; see `jaxid.estimators.servo_law` and `jaxid.estimators.servo_rate`. If the period is stated or
-    chosen, no delay has a smaller standard deviation than that of a uniform error of one period.
+    of the law acts on, and the rate of the loop, are chosen if the case does not state them; see
+    `jaxid.estimators.servo_law` and `jaxid.estimators.servo_rate`. If the period is stated or chosen, no
+    delay has a smaller standard deviation than that of a uniform error of one period.
 
     Args:
         session: Case and logs of the fit.
         numerics: Settings of the integration; None: chosen from machine and log.
         scaled: Whether an effort of known gain gives the scale, if nothing else does.
+        near: Whether the guesses are those of a fit at another loop, from which that of an arm starts.
         options: Further arguments of `output_error_steps`.
     """
 
     def fitted(session: Session, *, without_noise: bool = False) -> Steps[Estimate]:
-        return (yield from _fitted_steps(session, numerics, scaled, without_noise, **options))
+        return (yield from _fitted_steps(session, numerics, scaled, near, without_noise, **options))
 
-    if stands_apart(session.machine, parts_of(session)):
-        result = yield from fitted(session)
+    own_rate = numerics is None and (leaves_rate_open(session) or leaves_course_open(session))
+    at_rate = partial(with_rate_of_log, fitted=fitted) if own_rate else fitted
+    if leaves_law_open(session):
+        result = yield from with_law_of_log(session, at_rate)
     else:
-        own_rate = numerics is None and (leaves_rate_open(session) or leaves_course_open(session))
-        at_rate = partial(with_rate_of_log, fitted=fitted) if own_rate else fitted
-        if leaves_law_open(session):
-            result = yield from with_law_of_log(session, at_rate)
-        else:
-            result = yield from at_rate(session)
-            result = yield from beside_other_law(session, at_rate, result)
-        if own_rate:
-            return with_std_of_ticks(result)
+        result = yield from at_rate(session)
+        result = yield from beside_other_law(session, at_rate, result)
+    if own_rate:
+        return with_std_of_ticks(result)
     controller = session.case.controller
     stated = controller is not None and controller.period is not None
     return with_std_of_ticks(result) if stated else result
 
 
 def leaves_loop_open(session: Session) -> bool:
-    """Check that a fit of one servo chooses its law, its rate, or its command between two rows."""
-    if stands_apart(session.machine, parts_of(session)):
-        return False
+    """Check that a fit of servos chooses their law, their rate, or the command between two rows."""
     return leaves_law_open(session) or leaves_rate_open(session) or leaves_course_open(session)
 
 
 def at_its_loop_steps(session: Session) -> Steps[Estimate]:
-    """Fit one servo with the law, the rate and the command of its machine, whatever the case leaves open."""
-    return with_std_of_ticks((yield from _fitted_steps(session, None, False, False)))
+    """Fit servos with the law, the rate and the command of their machine, whatever the case leaves open."""
+    return with_std_of_ticks((yield from _fitted_steps(session, None, False, False, False)))
 
 
 def _fitted_steps(
-    session: Session, numerics: Numerics | None, scaled: bool, without_noise: bool, **options: Any
+    session: Session,
+    numerics: Numerics | None,
+    scaled: bool,
+    near: bool,
+    without_noise: bool,
+    **options: Any,
 ) -> Steps[Estimate]:
     """Fit as `unforced_steps` does; `without_noise`: one run of the loop without noise, which is faster."""
     machine = session.machine
     if stands_apart(machine, parts_of(session)):
-        return (yield from arm_steps(machine, parts_of(session), numerics=numerics, **options))
+        options |= {"numerics": numerics, "near": near, "without_noise": without_noise}
+        return (yield from arm_steps(machine, parts_of(session), **options))
     group = common_scale_group(machine, parts_of(session))
     base = base_of(machine, group) if group else None
     fitted = machine if base is None else without(machine, base)
@@ -111,7 +118,7 @@ def _fitted_steps(
     starts = coarse_starts(fitted, parts, chosen) if by_joints is None else [by_joints]
     if len(parts) > 1:
         starts = starts[:_STARTS_TOGETHER]
-    fit = output_error_steps if by_joints is None else whole_steps
+    fit = output_error_steps if by_joints is None or without_noise else whole_steps
     fits = []
     for start in starts:
         fits.append((yield from fit(fitted, parts, start=start, numerics=numerics, **options)))

@@ -66,7 +66,7 @@ def _assumed_period(case: Case, log: Log) -> Finding:
     return Finding(
         "warning",
         f"the period of the servo's loop is not stated: that of the log, {1e3 * log.period:.3g} ms, is "
-        "taken, unless identify finds another one in the log of one servo",
+        "taken, unless identify finds another one",
         f"{case.where}, [controller]",
         "state period: most servos run their loop at 200 Hz to some kHz, and gains depend on it",
     )

@@ -281,7 +281,8 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
         if also.clipped is not None:
             run = without_clipped(run, also.clipped, machine)
         run = _with_force_noise(run, also.force_noise)
-        more[k] = replace(run, reference_hold=run.reference_hold or also.reference_hold)
+        other = None if also.reference_hold == machine.reference_hold else also.reference_hold
+        more[k] = replace(run, reference_hold=run.reference_hold or other)
     return replace(
         session,
         machine=machine,

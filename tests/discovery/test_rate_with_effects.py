@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from benchmarks.unforced_arms import arm
 from benchmarks.unforced_machines import Servo
 
 RATE, EVERY, SECONDS = 1000.0, 20, 12.0
@@ -53,5 +54,20 @@ def test_the_rate_is_chosen_again_with_what_was_found():
     assert found.model_complete is True
     assert float(found.settings["period"]["value"].split()[0]) <= 2.01 / RATE
     for name, true in TRUE.items():
+        value = found.parameters[name]
+        assert abs(value.value - true) < 3.5 * value.std, name
+
+
+@pytest.mark.slow
+def test_the_rate_of_an_arm_is_chosen_again_with_what_was_found():
+    """The incomplete model shows 4 ms for 5 ms, with which friction and rotors are up to 20 sigma off."""
+    drawn = arm(2, "stribeck_friction", 1)
+    case = drawn.case()
+    del case["controller"]["period"], case["log"]["reference_hold"]
+    found = jaxid.discover(case, drawn.columns())
+    assert [effect.label for effect in found.effects] == ["stribeck_friction[2]"]
+    assert found.model_complete is True
+    assert found.settings["period"]["value"] == "0.005 s"
+    for name, true in drawn.truth().items():
         value = found.parameters[name]
         assert abs(value.value - true) < 3.5 * value.std, name

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from benchmarks.unforced_arms import arm
 from benchmarks.unforced_machines import servo
 from jaxid.estimators import servo_rate
 from jaxid.session import open_session
@@ -14,9 +15,14 @@ from jaxid.session import open_session
 def open_case(seed: int) -> tuple[dict, dict, object]:
     """A drawn servo, whose case states neither the period of its loop nor the course of its command."""
     drawn = servo(seed)
+    return without_rate(drawn), drawn.columns(), drawn
+
+
+def without_rate(drawn) -> dict:
+    """Return the case of a machine, without the period of its loop and the course of its command."""
     case = drawn.case()
     del case["controller"]["period"], case["log"]["reference_hold"]
-    return case, drawn.columns(), drawn
+    return case
 
 
 def fits(left: dict, tried: list, theta=lambda loop: 1.0):
@@ -142,10 +148,49 @@ def test_a_stated_period_is_kept():
 def test_the_rate_of_a_servo_is_found(seed):
     """At the rate of the log, inertias were 42 % off, and delays 40 standard deviations."""
     case, log, drawn = open_case(seed)
-    result = jaxid.identify(case, log)
+    check(jaxid.identify(case, log), drawn)
+
+
+def beside(drawn):
+    """Return the same machine under another command."""
+    return replace(drawn, command=-0.7 * drawn.command)
+
+
+def test_every_log_of_several_follows_the_course_of_the_command_that_is_tried():
+    """The others kept that of the case, which left ten times the noise of the right loop."""
+    drawn = servo(1)
+    session = open_session(without_rate(drawn), [drawn.columns(), beside(drawn).columns()])
+    assert servo_rate.leaves_rate_open(session)
+    tried = servo_rate._at(session, 4, "zero_order")
+    assert [run.machine(tried.machine).reference_hold for run in tried.fits] == ["zero_order"] * 2
+
+
+def test_logs_of_different_rates_keep_the_period_of_the_first():
+    drawn = servo(1)
+    slow = {name: column[::2] for name, column in beside(drawn).columns().items()}
+    assert not servo_rate.leaves_rate_open(open_session(without_rate(drawn), [drawn.columns(), slow]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 3])
+def test_the_rate_of_a_servo_is_found_in_two_logs(seed):
+    drawn = servo(seed)
+    result = jaxid.identify(without_rate(drawn), [drawn.columns(), beside(drawn).columns()])
+    check(result, drawn)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_rate_of_an_arm_is_found(seed):
+    """At the rate of the log values were up to 17 standard deviations off, and said to be incomplete."""
+    drawn = arm(seed)
+    check(jaxid.identify(without_rate(drawn), drawn.columns()), drawn)
+
+
+def check(result, drawn):
+    """Check a fit whose loop is that of a machine, or a faster one that leaves as little."""
     estimate, truth = result.estimate, drawn.truth()
-    period = float(estimate.details["settings"]["period"]["value"].split()[0])
-    assert period <= 1.01 / drawn.rate
+    assert float(estimate.details["settings"]["period"]["value"].split()[0]) <= 1.01 / drawn.rate
     assert estimate.details["settings"]["reference_hold"]["value"] == "zero_order"
     assert result.model_complete
     known = [k for k, ok in enumerate(estimate.identifiable) if ok]

@@ -149,7 +149,7 @@ def test_the_period_of_a_slow_log_is_questioned_as_that_of_the_loop(every, state
     found = open_session(tomllib.loads(case), given).findings
     assert [f.what for f in found if "period of the servo's loop" in f.what] == (every > 1 and not stated) * [
         "the period of the servo's loop is not stated: that of the log, 10 ms, is taken, unless identify "
-        "finds another one in the log of one servo"
+        "finds another one"
     ]
 
 

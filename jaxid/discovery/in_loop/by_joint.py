@@ -10,10 +10,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
 from jaxid.discovery.in_loop.arm_search import ArmSearch
+from jaxid.discovery.in_loop.unforced import at_any_loop, at_loop, loop_of, with_chosen_loop
 from jaxid.discovery.in_loop.whole_arm import declared_by_whole, with_fewest, without_unneeded
 from jaxid.discovery.result import Discovery
+from jaxid.estimators import steps_of
+from jaxid.estimators.effort import with_effort
+from jaxid.estimators.unforced import leaves_loop_open
+from jaxid.gap import gaps
+from jaxid.numerics.lanes import run_alone
 from jaxid.session import Session
 
 
@@ -28,6 +35,29 @@ def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[
     Raises:
         InputError: If no joint moves, or the loop of one cannot be simulated.
     """
+    if not leaves_loop_open(session):
+        return _searched(session, max_effects, progress)
+
+    progress("fitting the declared model at loops that the case allows")
+    chosen = run_alone(steps_of("output_error", session))
+    found = _searched(session.with_machine(at_loop(session.machine, chosen.machine)), max_effects, progress)
+    if found.effects:
+        # An incomplete model shows neither the law nor the rate of its loop.
+        progress("fitting what was found at loops that the case allows")
+        again = at_any_loop(session, found.after.machine)
+        if again.converged and loop_of(again.machine) != loop_of(chosen.machine):
+            chosen, at = again, session.with_machine(at_loop(session.machine, again.machine))
+            found = _searched(at, max_effects, progress)
+        elif again.converged:
+            new = gaps(again.machine, session.runs)
+            after = with_effort(again, session, new, searched=True)
+            after = replace(after, notes=(*found.after.notes, *after.notes))
+            found = replace(found, after=after, gaps_after=new)
+    return with_chosen_loop(found, chosen)
+
+
+def _searched(session: Session, max_effects: int, progress: Callable[[str], None]) -> Discovery:
+    """Search an arm at the loop of its machine."""
     progress("fitting the declared model, joint by joint")
     arm = ArmSearch.of(session)
     found: dict[int, Discovery] = {}

@@ -28,7 +28,7 @@ from jaxid.errors import InputError
 from jaxid.estimators import steps_of
 from jaxid.estimators.coarse_starts import coarse_starts, points_about
 from jaxid.estimators.effort import with_effort
-from jaxid.estimators.estimate import Estimate, misfit
+from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import parts_of
@@ -37,6 +37,7 @@ from jaxid.estimators.unforced import (
     at_its_loop_steps,
     common_scale_group,
     leaves_loop_open,
+    unforced_steps,
     with_free_scale,
     without,
 )
@@ -58,7 +59,7 @@ from jaxid.simulation.sensor_noise import position_noise
 UNSEEN = "a log without a force is compared in the simulated loop, which follows no jump at break-away"
 # Refit of a machine with what was found: session, machine, and the index of the unknown that gave the scale.
 Refit: TypeAlias = "Callable[[Session, Machine, int | None], Estimate]"
-# Misfit of a fit at another loop, over that at the first one, up to which it counts as good.
+# RMS that a fit at another loop leaves, over that at the first one, up to which it counts as good.
 _AS_GOOD = 1.02
 # Samples of the window in which the residual is loudest, as a part of the log.
 _WINDOW = 0.02
@@ -92,7 +93,7 @@ def explore_unforced(session: Session, *, max_effects: int, progress: Callable[[
     if not found.effects or loop_of(found.after.machine) == loop_of(before.machine):
         return found
     progress("searching again at the loop that shows with what was found")
-    at = session.with_machine(_at_loop(session.machine, found.after.machine))
+    at = session.with_machine(at_loop(session.machine, found.after.machine))
     before = _with_choices(run_alone(at_its_loop_steps(at)), found.after)
     before = replace(before, notes=(*before.notes, *_choices(found.after, "a fit with the effects found")))
     complete = not open_joints(at, found.after.machine, found.gaps_after)
@@ -121,11 +122,22 @@ def _refit_at_any_loop() -> Refit:
         names = frozenset(final.parameters.names)
         if names not in done:
             near = refitted(session, final, base)
-            best = run_alone(steps_of("output_error", session.with_machine(near.machine)))
-            done[names] = best if best.converged and misfit(best) <= _AS_GOOD * misfit(near) else near
+            best = at_any_loop(session, near.machine)
+            done[names] = best if best.converged and _rms(best) <= _AS_GOOD * _rms(near) else near
         return done[names]
 
     return refit
+
+
+def at_any_loop(session: Session, machine: Machine) -> Estimate:
+    """Fit a machine at the loops that the case allows, from the values of a fit at one of them."""
+    stated, demands = session.case.output_error, session.case.identification
+    options = {"minimiser": stated.minimiser, "hessian": demands.hessian}
+    return run_alone(unforced_steps(session.with_machine(machine), near=True, **options))
+
+
+def _rms(estimate: Estimate) -> float:
+    return float(np.sqrt(np.nanmean(np.square(estimate.residual))))
 
 
 def loop_of(machine: Machine) -> dict[str, Any]:
@@ -136,7 +148,7 @@ def loop_of(machine: Machine) -> dict[str, Any]:
     return {"period": law.period, **chosen, "reference_hold": machine.reference_hold}
 
 
-def _at_loop(machine: Machine, other: Machine) -> Machine:
+def at_loop(machine: Machine, other: Machine) -> Machine:
     """Return a machine with the loop of another one."""
     assert machine.controller is not None, "asked of a loop"
     loop = loop_of(other)
@@ -202,6 +214,13 @@ def explored_from(
         noise_floor=np.full(session.machine.plant.joints, np.nan),
         unseen=UNSEEN,
     )
+
+
+def with_chosen_loop(found: Discovery, chosen: Estimate) -> Discovery:
+    """Return a discovery with the loop that a fit chose among its settings and notes."""
+    before, after = (_with_choices(e, chosen) for e in (found.before, found.after))
+    said = [note for note in _choices(chosen, "a fit of the whole arm") if note not in after.notes]
+    return replace(found, before=before, after=replace(after, notes=(*after.notes, *said)))
 
 
 def _with_choices(after: Estimate, before: Estimate) -> Estimate:

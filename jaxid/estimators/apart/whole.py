@@ -53,6 +53,8 @@ def arm_steps(
     *,
     numerics: Numerics | None = None,
     profile: Sequence[str] = (),
+    near: bool = False,
+    without_noise: bool = False,
     **options: Any,
 ) -> Steps[Estimate]:
     """Fit the servos of an arm joint by joint, and then all at once unless that would take too long.
@@ -62,6 +64,9 @@ def arm_steps(
         parts: The logs.
         numerics: Settings of the integration; None: chosen from machine and log.
         profile: Names of unknowns of the arm whose profile is computed.
+        near: Whether the whole arm is fitted from the guesses of the machine, and joints alone only if that
+            does not converge.
+        without_noise: Whether one fit of the whole arm is enough, without noise in its loops.
         options: Further arguments of `output_error_steps`.
 
     Returns:
@@ -69,12 +74,17 @@ def arm_steps(
         arm would take too long, if a joint never moves, or if the fit of the whole arm does not converge.
     """
     refused = why_not_whole(machine, parts, numerics)
+    fit = _to_ticks if without_noise else whole_steps
+    of_whole = {"numerics": numerics, "profile": profile, **options}
+    if near and not refused:
+        whole = yield from fit(machine, parts, start=machine.parameters.guess, **of_whole)
+        if whole.converged:
+            return whole
     own = profile if refused else ()
     alone = yield from apart_steps(machine, parts, numerics=numerics, profile=own, **options)
     if refused:
         return replace(alone, notes=(*alone.notes, refused))
-    options |= {"numerics": numerics, "profile": profile}
-    whole = yield from whole_steps(machine, parts, start=alone.theta, **options)
+    whole = yield from fit(machine, parts, start=alone.theta, **of_whole)
     if whole.converged or not alone.converged:
         return whole
     return replace(alone, notes=(*alone.notes, f"a fit of the whole arm from there failed: {whole.message}"))
@@ -99,12 +109,12 @@ def whole_steps(
         The best fit.
     """
     options |= {"tolerance": TOLERANCE} if len(parts) > 1 else {}
-    best = yield from _to_ticks(machine, parts, start, options)
+    best = yield from _to_ticks(machine, parts, start, **options)
     for _ in range(_RENEWALS):
         if not _leaves_more_than_noise(best, parts):
             break
         again = yield from _by_simulated_loads(machine, parts, best.theta)
-        new = yield from _to_ticks(machine, parts, again, options)
+        new = yield from _to_ticks(machine, parts, again, **options)
         gained = misfit(best) - misfit(new)
         best = min(best, new, key=_rank)
         if not gained > _NEWS * abs(misfit(best)):
@@ -121,7 +131,7 @@ def _rank(fit: Estimate) -> tuple[bool, float]:
 
 
 def _to_ticks(
-    machine: Machine, parts: Sequence[Part], start: Float[np.ndarray, " p"], options: dict[str, Any]
+    machine: Machine, parts: Sequence[Part], start: Float[np.ndarray, " p"], **options: Any
 ) -> Steps[Estimate]:
     """Return the better of a fit from some values, and one from the ticks next to its delays."""
     first = yield from output_error_steps(machine, parts, start=start, **options)
