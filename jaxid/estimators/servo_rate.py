@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxid.estimators.estimate import INTERVAL, Estimate, misfit
-from jaxid.estimators.servo_law import leaves_clearly_less, leaves_far_more_than_noise
+from jaxid.estimators.servo_law import Fitted, leaves_clearly_less, leaves_far_more_than_noise
 from jaxid.logs.log import SLOW_LOOP
 from jaxid.numerics.lanes import Steps
 

@@ -98,7 +98,7 @@ def followed(
     scaled = readings[:, moves] / np.std(readings[:, moves], axis=0)
     if not scaled.size:
         return None
-    slopes = np.apply_along_axis(np.convolve, 0, scaled, _SLOPE, "same")
+    slopes = np.stack([np.convolve(column, _SLOPE, "same") for column in scaled.T], axis=1)
     # A difference counts if its five slopes were taken from rows without one missing between them.
     reach = len(_SLOPE) - 1
     counts = np.flatnonzero(index[2 * reach :] - index[: -2 * reach] == 2 * reach) + reach // 2
@@ -122,7 +122,7 @@ def followed(
 
 
 def _differences(columns: np.ndarray) -> np.ndarray:
-    return np.apply_along_axis(np.convolve, 0, columns, _DIFFERENCE, "valid")
+    return np.stack([np.convolve(column, _DIFFERENCE, "valid") for column in columns.T], axis=1)
 
 
 def _index(base: TimeBase) -> np.ndarray | None:

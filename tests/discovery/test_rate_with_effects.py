@@ -1,11 +1,17 @@
 """The rate of a servo's loop in a search, which a model without the hidden effect does not show."""
 
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 import jaxid
 from benchmarks.unforced_arms import arm
 from benchmarks.unforced_machines import Servo
+from jaxid.discovery.in_loop import unforced
+from jaxid.session import open_session
 
 RATE, EVERY, SECONDS = 1000.0, 20, 12.0
 COUNT = 2 * np.pi / 4096
@@ -28,6 +34,66 @@ CASE = {
     "sensor": {"position_resolution": COUNT, "position_noise": 0.0},
     "log": {"time": "t", "position": "q", "reference": "r"},
 }
+
+
+@dataclass(frozen=True)
+class FakeFit:
+    """What a search takes of a fit."""
+
+    machine: Any
+    notes: tuple[str, ...] = ()
+    details: dict = field(default_factory=dict)
+
+
+@pytest.fixture
+def searched(monkeypatch):
+    """Searches whose first one ends at a loop of some period, and what they were asked for."""
+    t = 0.02 * np.arange(300)
+    session = open_session(CASE, {"t": t, "q": np.sin(t), "r": np.sin(t)})
+
+    def at(period: float) -> FakeFit:
+        machine = session.machine
+        settings = {"period": {"value": f"{period} s", "reason": "it leaves least"}}
+        law = replace(machine.controller, period=period)
+        return FakeFit(replace(machine, controller=law), details={"settings": settings})
+
+    def search(period: float, left: set[int], effects: bool = True):
+        calls: list[tuple[float, Any]] = []
+        rival = SimpleNamespace(candidate=SimpleNamespace(kind="load_friction"))
+        named = SimpleNamespace(kind="stribeck_friction", alternatives=(rival,))
+
+        def explored(session, before, *, among=None, **more):
+            calls.append((session.machine.controller.period, among))
+            return SimpleNamespace(effects=(named,) * effects, after=at(period), gaps_after=())
+
+        def steps(value):
+            return value
+            yield
+
+        monkeypatch.setattr(unforced, "explored_from", explored)
+        monkeypatch.setattr(unforced, "open_joints", lambda *a: left)
+        monkeypatch.setattr(unforced, "steps_of", lambda *a: steps(at(0.005)))
+        monkeypatch.setattr(unforced, "at_its_loop_steps", lambda session: steps(FakeFit(session.machine)))
+        unforced.explore_unforced(session, max_effects=3, progress=lambda text: None)
+        return calls
+
+    return search
+
+
+def test_a_search_ends_where_what_was_found_keeps_the_loop(searched):
+    assert searched(0.005, {0}) == [(0.02, None)]
+    assert searched(0.001, {0}, effects=False) == [(0.02, None)]
+
+
+def test_a_search_runs_again_at_the_loop_that_what_was_found_shows(searched):
+    assert searched(0.001, {0}) == [(0.02, None), (0.001, None)]
+
+
+def test_the_second_search_is_among_what_was_found_and_its_rivals_if_that_leaves_noise(searched):
+    assert searched(0.001, set()) == [
+        (0.02, None),
+        (0.001, frozenset({"stribeck_friction", "load_friction"})),
+    ]
 
 
 @pytest.mark.slow
