@@ -125,7 +125,10 @@ def _over_noise(session: Session, estimate: Estimate) -> float:
     largest = 0.0
     for rows, run in zip(np.split(estimate.residual, ends), session.fits, strict=True):
         floor = np.maximum(position_noise(run.machine(session.machine), run.log), 1e-300)
-        rms = np.sqrt(np.nanmean(np.square(rows), axis=0))
+        # A joint at rest has no residual.
+        counts = np.isfinite(rows)
+        squares = np.sum(np.where(counts, np.square(rows), 0.0), axis=0)
+        rms = np.sqrt(squares / np.maximum(np.sum(counts, axis=0), 1))
         largest = max(largest, float(np.max((rms / floor)[list(run.log.measured)])))
     return largest
 

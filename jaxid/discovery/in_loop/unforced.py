@@ -294,7 +294,7 @@ def _search(
     machine: Machine,
     effort: Effort,
     progress: Callable[[str], None],
-    among: frozenset[str] | None,
+    among: frozenset[str] | None = None,
 ) -> LoopSearch:
     """Return the search for the effects that a fitted machine lacks; `among`: kinds, or those of the case."""
     first = session.fit.machine(machine)
