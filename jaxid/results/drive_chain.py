@@ -49,7 +49,7 @@ def _controller_lines(session: Session, machine: Machine) -> list[str]:
     if controller is None or machine.controller is None:
         return ["not in the case"]
     # The fit may have chosen the period.
-    return [controller.kind.replace("_", " "), f"{plain(1 / machine.controller.period, 4)} Hz"]
+    return [controller.kind.replace("_", " "), f"{1 / machine.controller.period:.4g} Hz"]
 
 
 def _drive_lines(session: Session) -> list[str]:
