@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxid.arrays import Array
 from jaxid.model.parameter import parameters_of
 from jaxid.model.plant import Plant
-from jaxid.numerics.delays import accelerated, lagged, shifted
+from jaxid.numerics.delays import accelerated, lagged, shifted, slewed
 from jaxid.numerics.smooth import outside, sharp_clip
 
 
@@ -92,6 +92,8 @@ class Controller(eqx.Module):
         delay: Transport delay of the reference [s], one for all drives or one each; None: none. Between two
             ticks the delayed reference is interpolated, so that derivatives by the delay exist.
         lag: Time constant of a first-order lag of the reference [s], as for `delay`; None: none. See `path`.
+        speed: Largest velocity of the reference that the law follows [m/s or rad/s], as for `delay`; None: no
+            limit. See `path`.
         acceleration: Largest acceleration of the reference that the law follows [m/s^2 or rad/s^2], as for
             `delay`; None: no limit. See `path`.
         dead_band: Position error that counts as zero, with all smaller ones [m or rad], as for `delay`; None:
@@ -104,6 +106,7 @@ class Controller(eqx.Module):
     limit: Array | None = eqx.field(default=None, kw_only=True)
     delay: Array | None = eqx.field(default=None, kw_only=True)
     lag: Array | None = eqx.field(default=None, kw_only=True)
+    speed: Array | None = eqx.field(default=None, kw_only=True)
     acceleration: Array | None = eqx.field(default=None, kw_only=True)
     dead_band: Array | None = eqx.field(default=None, kw_only=True)
     velocity_average: int = eqx.field(static=True, default=1, kw_only=True)
@@ -121,16 +124,19 @@ class Controller(eqx.Module):
     separate_drives: ClassVar[bool] = False
 
     def path(self, reference: Float[Array, "ticks m"]) -> Path:
-        """Return the reference behind delay, lag and profile, with the derivatives that the law needs.
+        """Return the reference behind delay, lag and limits, with the derivatives that the law needs.
 
         The lag takes a step of backward Euler at each tick, so that without a time constant the reference
-        passes; it has settled at the first reference. The profile is that of
-        `jaxid.numerics.delays.accelerated`. Derivatives are central differences.
+        passes; it has settled at the first reference. The limits are those of
+        `jaxid.numerics.delays.slewed` and `jaxid.numerics.delays.accelerated`. Derivatives are central
+        differences.
         """
         if self.delay is not None:
             reference = shifted(reference, self.delay / self.period)
         if self.lag is not None:
             reference = lagged(reference, self.period / (self.period + self.lag))
+        if self.speed is not None:
+            reference = slewed(reference, self.speed, self.period)
         if self.acceleration is not None:
             reference = accelerated(reference, self.acceleration, self.period)
         if not self.anticipates:

@@ -89,6 +89,38 @@ class CommandLag(_OnCommand):
         return [{"time_constant": s} for s in _times(scales)]
 
 
+@register("velocity_limit")
+class VelocityLimit(_OnCommand):
+    """Limit of the command's velocity in front of the controller, which follows faster commands later.
+
+    At each tick r'[k] = r'[k-1] + clip(r[k] - r'[k-1], -limit h, limit h) with h the controller's period.
+    """
+
+    title = "a command that is followed with a limited velocity"
+    formula = "|dr/dt| ≤ limit, r being the command of the controller"
+    met = "servos and drives with a largest speed of their set point, such as Dynamixel's profile velocity"
+    part = "controller"
+
+    controller_field = "speed"
+    of_reference = True
+    # A command of any machine is far slower.
+    elsewhere = 1e9
+
+    limit: Array = parameter("position/time", "positive", "largest velocity of the command")
+
+    def curve(self) -> tuple[str, str, np.ndarray, np.ndarray]:
+        time = np.linspace(-0.4, 1.6, 201) / float(self.limit)
+        return *_AFTER_A_STEP, time, np.clip(float(self.limit) * time, 0.0, 1.0)
+
+    @classmethod
+    def neutral(cls, scales: Scales) -> dict[str, float]:
+        return {"limit": cls.elsewhere}
+
+    @classmethod
+    def starts(cls, scales: Scales) -> list[dict[str, float]]:
+        return [{"limit": scales.peak_velocity * s} for s in (0.6, 0.8, 0.95, 1.1)]
+
+
 @register("acceleration_limit")
 class AccelerationLimit(_OnCommand):
     """Profile generator in front of the controller, which follows the command with a limited acceleration.

@@ -1,4 +1,4 @@
-"""Delays, lags and limited accelerations of sampled signals, with derivatives by their parameters."""
+"""Delays, lags and limits of the rates of sampled signals, with derivatives by their parameters."""
 
 from __future__ import annotations
 
@@ -64,6 +64,23 @@ def lagged(signal: Float[Array, "time m"], part: Array) -> Float[Array, "time m"
         return new, new
 
     return jax.lax.scan(follow, jnp.asarray(signal[0], float), signal)[1]
+
+
+def slewed(signal: Float[Array, "time m"], limit: Array, period: float) -> Float[Array, "time m"]:
+    """Follow a signal with a limited velocity; the result starts at the first sample.
+
+    Args:
+        signal: Target at the samples, (time, m).
+        limit: Largest velocity, above zero, one for all columns or one each [unit of the signal / s].
+        period: Time between two samples [s].
+    """
+
+    def follow(last: Array, now: Array) -> tuple[Array, Array]:
+        new = last + sharp_clip(now - last, limit * period)
+        return new, new
+
+    first = jnp.asarray(signal[0], float)
+    return jax.lax.scan(follow, first + jnp.zeros_like(limit), signal)[1]
 
 
 def accelerated(signal: Float[Array, "time m"], limit: Array, period: float) -> Float[Array, "time m"]:

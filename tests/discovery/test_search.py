@@ -52,7 +52,7 @@ ELSEWHERE = {
     ),
 }
 # Effects that only a log without a force is searched for, in `discovery/test_without_force.py`.
-IN_LOOP = {"command_lag", "acceleration_limit", "dead_band", "load_friction"}
+IN_LOOP = {"command_lag", "velocity_limit", "acceleration_limit", "dead_band", "load_friction"}
 
 
 # The damping by a drive's voltage is known from its data; as a force it is viscous friction.

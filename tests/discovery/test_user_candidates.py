@@ -107,7 +107,8 @@ def test_candidates_stand_beside_the_registered_and_leave_the_model_alone(tmp_pa
     found = {c.kind for c in union(path, log).candidates}
     # An axis has no spring that could have clearance, and no stages apart; the drive's are not asked for.
     elsewhere = {"backlash", "velocity_hysteresis", "actuator_offset", "voltage_limit", "back_emf_damping"}
-    elsewhere |= {"unbalance", "load_friction", "command_delay", "command_lag", "acceleration_limit"}
+    elsewhere |= {"unbalance", "load_friction", "command_delay", "command_lag"}
+    elsewhere |= {"velocity_limit", "acceleration_limit"}
     elsewhere |= {"dead_band"}
     assert found == {*EFFECTS, "my_effects.py:Hum"} - {VISCOUS[0], COULOMB[0]} - elsewhere
     effects = open_session(path, log).machine.plant.effects

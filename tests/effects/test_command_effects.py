@@ -11,10 +11,10 @@ from jaxid.controllers import CONTROLLERS, with_effects
 from jaxid.controllers.base import Tick
 from jaxid.effects import EFFECTS
 from jaxid.errors import InputError
-from jaxid.numerics.delays import accelerated
+from jaxid.numerics.delays import accelerated, slewed
 from jaxid.numerics.smooth import outside
 from jaxid.plants import Axis
-from truth.axis.stepper import Loop, Machine, Sensor, profile, simulate
+from truth.axis.stepper import Loop, Machine, Sensor, profile, reached, simulate
 
 PERIOD = 1e-3
 AS_EFFECT = {"command_delay": ("delay", 0.0123), "dead_band": ("width", 0.02)}
@@ -146,11 +146,38 @@ def test_the_slope_by_a_limit_of_the_acceleration_is_exact(name):
     np.testing.assert_allclose(slope, apart, atol=1e-8)
 
 
-def test_a_limit_that_no_command_reaches_changes_nothing():
-    """It stands at drives without the effect, and where a search begins."""
+@pytest.mark.parametrize("name", ["step", "steps", "sine"])
+def test_a_limited_velocity_is_the_independent_steppers(name):
+    target = targets()[name]
+    law = CONTROLLERS["pd"](kp=jnp.asarray([1.0]), kd=jnp.asarray([0.0]), period=PERIOD)
+    law = with_effects(law, Axis(1.0, effects=(EFFECTS["velocity_limit"](limit=jnp.asarray(1.7)),)), 1)
+    got = np.asarray(law.path(jnp.asarray(target)[:, None]).reference)[:, 0]
+    exact = reached(target, Machine(1.0, {"velocity_limit": {"limit": 1.7}}), 1 / PERIOD)
+    np.testing.assert_allclose(got, exact, rtol=0, atol=1e-12)
+    assert np.abs(target - got).max() > 0.05
+    assert np.abs(np.diff(got)).max() < 1.7 * PERIOD * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("name", ["step", "steps", "sine"])
+def test_the_slope_by_a_limit_of_the_velocity_is_exact(name):
+    target = jnp.asarray(targets()[name])[:, None]
+
+    def run(limit):
+        return slewed(target, limit, PERIOD)[:, 0]
+
+    slope = jax.jvp(run, (jnp.asarray(1.717),), (jnp.ones(()),))[1]
+    apart = (run(1.717 + 1e-6) - run(1.717 - 1e-6)) / 2e-6
+    assert np.abs(slope).max() > 1e-3
+    np.testing.assert_allclose(slope, apart, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["velocity_limit", "acceleration_limit"])
+def test_a_limit_where_a_search_begins_changes_nothing(kind):
     target = jnp.asarray(targets()["steps"])[:, None]
-    limit = jnp.asarray(EFFECTS["acceleration_limit"].elsewhere)
-    np.testing.assert_allclose(accelerated(target, limit, PERIOD), target, rtol=0, atol=1e-15)
+    law = CONTROLLERS["pd"](kp=jnp.asarray([1.0]), kd=jnp.asarray([0.0]), period=PERIOD)
+    effect = EFFECTS[kind](limit=jnp.asarray(EFFECTS[kind].elsewhere))
+    got = with_effects(law, Axis(1.0, effects=(effect,)), 1).path(target).reference
+    np.testing.assert_allclose(got, target, rtol=0, atol=1e-15)
 
 
 def test_an_error_in_the_dead_band_counts_as_none():

@@ -124,6 +124,7 @@ ROWS: dict[str, Row] = {
     # On the reference and on the error in front of the law: tests of the loop cover them.
     "command_delay": Row("command_delay", {"delay": 2.4e-3}, lambda x: x.u),
     "command_lag": Row("command_lag", {"time_constant": 6e-3}, lambda x: x.u),
+    "velocity_limit": Row("velocity_limit", {"limit": 0.3}, lambda x: x.u),
     "acceleration_limit": Row("acceleration_limit", {"limit": 40.0}, lambda x: x.u),
     "dead_band": Row("dead_band", {"width": 1e-3}, lambda x: x.u),
     "load_friction of one coefficient": Row(

@@ -58,6 +58,7 @@ EFFECTS = {
 ON_COMMAND = {
     "command_delay": "delay",
     "command_lag": "time_constant",
+    "velocity_limit": "limit",
     "acceleration_limit": "limit",
     "dead_band": "width",
 }
@@ -201,10 +202,11 @@ def control_law(loop: Loop) -> kernel.Law:
 
 
 def reached(reference: np.ndarray, machine: Machine, rate: float) -> np.ndarray:
-    """Return what reaches the law of a reference [m], behind delay, lag and profile of the command.
+    """Return what reaches the law of a reference [m], behind delay, lag and limits of the command.
 
     The delayed reference is joined by lines; the lag is the low-pass y[k] = a r[k] + (1 - a) y[k-1] that has
-    settled at the first reference, with a = h / (T + h). See `profile` for a limited acceleration.
+    settled at the first reference, with a = h / (T + h). A limited velocity moves to the reference by at most
+    that much a tick. See `profile` for a limited acceleration.
     """
     delay, constant = (
         machine.effects.get(kind, {}).get(ON_COMMAND[kind], 0.0) for kind in ("command_delay", "command_lag")
@@ -213,8 +215,12 @@ def reached(reference: np.ndarray, machine: Machine, rate: float) -> np.ndarray:
     out = np.interp(t - delay, t, reference)
     a = 1.0 / (1.0 + constant * rate)
     lagged = scipy.signal.lfilter([a], [1.0, a - 1.0], out - out[0]) + out[0]
+    fastest = machine.effects.get("velocity_limit", {}).get("limit", np.inf) / rate
+    slow = [lagged[0]]
+    for goal in lagged[1:]:
+        slow.append(min(max(goal, slow[-1] - fastest), slow[-1] + fastest))
     limit = machine.effects.get("acceleration_limit", {}).get("limit")
-    return lagged if limit is None else profile(lagged, limit, rate)
+    return np.asarray(slow) if limit is None else profile(np.asarray(slow), limit, rate)
 
 
 def profile(target: np.ndarray, limit: float, rate: float) -> np.ndarray:
