@@ -18,6 +18,7 @@ from jaxid.machine import Machine
 from jaxid.numerics.lanes import Steps
 from jaxid.simulation.noisy_loop import ReadingNoise, estimated_noise
 from jaxid.simulation.replay import Numerics, make_replay
+from jaxid.simulation.step_size import TooStiffError
 
 # Number of times that the noise of the encoder is estimated, and the unknowns refitted.
 _RENEWALS = 2
@@ -77,11 +78,19 @@ def noise_of_parts(
         numerics: Settings of the integration; None: chosen from machines and logs.
         follows: See `jaxid.simulation.noisy_loop.ReadingNoise`.
         before: Noise of each log at values nearby; empty: it is estimated anew.
+
+    Returns:
+        The noise by log; None where nothing is known of it, or the loop is too stiff to be simulated.
     """
     found: list[ReadingNoise | None] = []
     for part, near in zip(parts, before or [None] * len(parts), strict=True):
         at = part.at(theta)
-        replay = make_replay(at, part.log, numerics or choose_numerics(at, part.log))
+        try:
+            replay = make_replay(at, part.log, numerics or choose_numerics(at, part.log))
+        except TooStiffError:
+            # The fit of an incomplete model may run there.
+            found.append(None)
+            continue
         found.append(estimated_noise(at, part.log, replay, follows=follows, before=near))
     return found
 
