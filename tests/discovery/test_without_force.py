@@ -127,7 +127,6 @@ def test_missing_dry_friction_is_named(text):
 
 HIDDEN = {
     "command_lag": {"time_constant": 0.03},
-    "velocity_limit": {"limit": 3.0},
     "acceleration_limit": {"limit": 15.0},
     "dead_band": {"width": 0.02},
     "load_friction": {"coefficient": 0.25},

@@ -1,11 +1,13 @@
 """Servos whose derivative acts on the error or on the velocity, which the case does not state."""
 
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import jaxid
+from jaxid.estimators import servo_law
 from jaxid.results.found_case import case_text
 from truth.axis.machines import multisine
 from truth.axis.stepper import Loop, Machine, Sensor, simulate
@@ -69,6 +71,18 @@ def log(law: str, seed: int) -> dict[str, np.ndarray]:
         initial_position=float(command[0]),
     )
     return {"t": run["t"], "q": run["position"], "r": command}
+
+
+def test_a_joint_at_rest_hides_none_that_moves(monkeypatch):
+    """Readings that do not count have no residual."""
+    monkeypatch.setattr(servo_law, "position_noise", lambda machine, log: np.array([1.0, 0.5]))
+    arm = SimpleNamespace(
+        log=SimpleNamespace(samples=4, measured=(True, True)), machine=lambda machine: machine
+    )
+    session = SimpleNamespace(fits=[arm], machine=None)
+    fit = SimpleNamespace(residual=np.array([[np.nan, 1.5]] * 4))
+    assert servo_law._over_noise(session, fit) == 3.0
+    assert servo_law.leaves_far_more_than_noise(session, fit)
 
 
 CASES = [(law, seed) for law in LAWS for seed in range(4)]
