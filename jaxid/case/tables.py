@@ -94,7 +94,7 @@ UNKNOWN_OF_CONTROLLER = {
     "dead_band": ("position", "nonnegative"),
 }
 # Fields of every controller that the columns of a log, or an effect, decide.
-_OF_LOG = ("own_velocity", "lag")
+_OF_LOG = ("own_velocity", "lag", "speed")
 # Laws whose gains may be unknown.
 _LINEAR = ("cascade_pd", "pd", "pid")
 # Laws whose gains act on a velocity that is itself a gain times the position error.

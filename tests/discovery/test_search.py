@@ -50,9 +50,13 @@ ELSEWHERE = {
         "discovery/test_without_force.py",
         "test_a_missing_delay_is_named_and_put_into_the_controller",
     ),
+    "velocity_limit": (
+        "discovery/test_velocity_limit.py",
+        "test_a_limited_velocity_of_the_command_is_named_with_its_value",
+    ),
 }
 # Effects that only a log without a force is searched for, in `discovery/test_without_force.py`.
-IN_LOOP = {"command_lag", "velocity_limit", "acceleration_limit", "dead_band", "load_friction"}
+IN_LOOP = {"command_lag", "acceleration_limit", "dead_band", "load_friction"}
 
 
 # The damping by a drive's voltage is known from its data; as a force it is viscous friction.
