@@ -209,7 +209,7 @@ def _score(
 
     scores = [replace(s, second=alone[k][1]) if k in alone else s for k, s in best.items()]
     out.scores = sorted(scores, key=lambda s: -s.evidence)
-    if not np.all(np.isfinite(largest)):
+    if np.all(np.isneginf(largest)):
         # Nothing was tried, so that noise gains nothing by it.
         largest = np.zeros_like(largest)
     ends = np.cumsum([k.shape[1] for k in kinds])[:-1]

@@ -103,6 +103,11 @@ class Estimate:
         return "\n".join(lines)
 
 
+def rms_left(estimate: Estimate) -> float:
+    """Return the RMS of what a fit leaves of the logs, in the unit of its residual; NaN does not count."""
+    return float(np.sqrt(np.nanmean(np.square(estimate.residual))))
+
+
 def misfit(estimate: Estimate) -> float:
     """Return a number by which fits of the same logs compare, the least one that of the best fit.
 

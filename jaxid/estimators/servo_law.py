@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxid.consistency.hold import clearly_smaller
 from jaxid.controllers.linear import PD
-from jaxid.estimators.estimate import Estimate, misfit
+from jaxid.estimators.estimate import Estimate, misfit, rms_left
 from jaxid.model.unknowns import CONTROLLER
 from jaxid.names import LAW_DERIVATIVES
 from jaxid.numerics.lanes import Steps
@@ -75,7 +75,8 @@ def with_law_of_log(session: Session, fitted: Fitted) -> Steps[Estimate]:
         # An incomplete model shows no law: it may lack what either of them would pass for.
         return by_error
 
-    sizes = f"{_rms(by_error):.3g} with one of the error, {_rms(by_velocity):.3g} with one of the velocity"
+    left = [rms_left(by_error), rms_left(by_velocity)]
+    sizes = f"{left[0]:.3g} with one of the error, {left[1]:.3g} with one of the velocity"
     reason = f"RMS that the fitted loops leave with a derivative: {sizes}"
     if by_error.converged and leaves_clearly_less(by_error, by_velocity):
         return _said(by_error, "error", reason)
@@ -105,7 +106,12 @@ def beside_other_law(session: Session, fitted: Fitted, estimate: Estimate) -> St
     found = yield from fitted(session.with_machine(other))
     if not found.converged or not leaves_clearly_less(found, estimate):
         return estimate
-    clearly = {"derivative": name, "rms": _rms(found), "stated": law.derivative, "rms_stated": _rms(estimate)}
+    clearly = {
+        "derivative": name,
+        "rms": rms_left(found),
+        "stated": law.derivative,
+        "rms_stated": rms_left(estimate),
+    }
     return replace(estimate, details={**estimate.details, "other_law": clearly})
 
 
@@ -154,10 +160,6 @@ def _derivative_acts(estimate: Estimate) -> bool:
         if value > _ACTS * std:
             return True
     return False
-
-
-def _rms(estimate: Estimate) -> float:
-    return float(np.sqrt(np.nanmean(np.square(estimate.residual))))
 
 
 def _said(estimate: Estimate, derivative: str, reason: str) -> Estimate:

@@ -11,9 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from jaxid.estimators.estimate import INTERVAL, Estimate, misfit
+from jaxid.estimators.estimate import INTERVAL, Estimate, misfit, rms_left
 from jaxid.estimators.servo_law import Fitted, leaves_clearly_less, leaves_far_more_than_noise
 from jaxid.logs.log import SLOW_LOOP
 from jaxid.numerics.lanes import Steps
@@ -50,7 +48,7 @@ class _Loop:
     @property
     def rms(self) -> float:
         """RMS of the position that it leaves [m or rad]."""
-        return float(np.sqrt(np.nanmean(np.square(self.estimate.residual))))
+        return rms_left(self.estimate)
 
     def words(self, period: float | None) -> str:
         """Return the loop in words, for a log of some period [s]; None: its own period is stated."""

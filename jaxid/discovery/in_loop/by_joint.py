@@ -44,11 +44,11 @@ def explore_by_joint(session: Session, *, max_effects: int, progress: Callable[[
     if found.effects:
         # An incomplete model shows neither the law nor the rate of its loop.
         progress("fitting what was found at loops that the case allows")
-        again = at_any_loop(session, found.after.machine)
-        if again.converged and loop_of(again.machine) != loop_of(chosen.machine):
+        again = at_any_loop(session, found.after)
+        if loop_of(again.machine) != loop_of(chosen.machine):
             chosen, at = again, session.with_machine(at_loop(session.machine, again.machine))
             found = _searched(at, max_effects, progress)
-        elif again.converged:
+        elif again is not found.after:
             new = gaps(again.machine, session.runs)
             after = with_effort(again, session, new, searched=True)
             after = replace(after, notes=(*found.after.notes, *after.notes))

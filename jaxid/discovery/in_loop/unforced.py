@@ -28,7 +28,7 @@ from jaxid.errors import InputError
 from jaxid.estimators import steps_of
 from jaxid.estimators.coarse_starts import coarse_starts, points_about
 from jaxid.estimators.effort import with_effort
-from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.estimate import Estimate, rms_left
 from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import parts_of
@@ -121,23 +121,21 @@ def _refit_at_any_loop() -> Refit:
     def refit(session: Session, final: Machine, base: int | None) -> Estimate:
         names = frozenset(final.parameters.names)
         if names not in done:
-            near = refitted(session, final, base)
-            best = at_any_loop(session, near.machine)
-            done[names] = best if best.converged and _rms(best) <= _AS_GOOD * _rms(near) else near
+            done[names] = at_any_loop(session, refitted(session, final, base))
         return done[names]
 
     return refit
 
 
-def at_any_loop(session: Session, machine: Machine) -> Estimate:
-    """Fit a machine at the loops that the case allows, from the values of a fit at one of them."""
+def at_any_loop(session: Session, near: Estimate) -> Estimate:
+    """Return the best fit at the loops that the case allows, from the values of a fit at one of them.
+
+    It is the given fit if none converges and leaves as little.
+    """
     stated, demands = session.case.output_error, session.case.identification
     options = {"minimiser": stated.minimiser, "hessian": demands.hessian}
-    return run_alone(unforced_steps(session.with_machine(machine), near=True, **options))
-
-
-def _rms(estimate: Estimate) -> float:
-    return float(np.sqrt(np.nanmean(np.square(estimate.residual))))
+    best = run_alone(unforced_steps(session.with_machine(near.machine), near=True, **options))
+    return best if best.converged and rms_left(best) <= _AS_GOOD * rms_left(near) else near
 
 
 def loop_of(machine: Machine) -> dict[str, Any]:
@@ -219,7 +217,8 @@ def explored_from(
 def with_chosen_loop(found: Discovery, chosen: Estimate) -> Discovery:
     """Return a discovery with the loop that a fit chose among its settings and notes."""
     before, after = (_with_choices(e, chosen) for e in (found.before, found.after))
-    said = [note for note in _choices(chosen, "a fit of the whole arm") if note not in after.notes]
+    # A fit that chose the loop itself says so.
+    said = () if found.after.details.get("settings") else _choices(chosen, "a fit of the whole arm")
     return replace(found, before=before, after=replace(after, notes=(*after.notes, *said)))
 
 
