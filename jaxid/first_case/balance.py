@@ -22,6 +22,9 @@ _OFFSET = 0.5
 _REST, _REVERSED = 0.02, 0.02
 # Deviation of a force over its mean below which it is one level, whose motion shows the rest.
 _LEVEL = 0.05
+# Part of a force's variance that a balance of forces with a direction must explain, and the part that it may
+# leave of what a balance of magnitudes leaves.
+_DIRECTED, _CLEARLY_LESS = 0.9, 0.25
 # Part of a force that dry friction is taken to be if the motion does not reverse.
 _DRY = 0.05
 
@@ -114,6 +117,31 @@ def rough_balance(
         if one.inertia * other.inertia > 0 and 1 / _AGREE < one.inertia / other.inertia < _AGREE:
             return other
     return max(found, key=lambda r: r.explained)
+
+
+def has_direction(force: Signal, position: Signal) -> bool:
+    """Check whether a column that is never negative pushes in one direction, and is no magnitude.
+
+    Inertia and friction act along the motion. In a force that always holds a weight they change their sign
+    with the motion; in a magnitude they do not. Both are tried beside a weight, which is a parabola of the
+    position here, and of all running means the one that explains most decides.
+    """
+    velocity = (position[2:] - position[:-2]) / 2.0
+    acceleration = position[2:] - 2.0 * position[1:-1] + position[:-2]
+    best, magnitude = 0.0, 0.0
+    for window in windows(velocity.size):
+        f, a, v, q = (smooth(s, window) for s in (force[1:-1], acceleration, velocity, position[1:-1]))
+        moves = _signs(v) != 0
+        f, a, v, q = (s[moves] for s in (f, a, v, q))
+        if f.size <= 20 or f.std() == 0 or not _reverses(v):
+            continue
+        sign, weight = np.sign(v), [np.ones_like(f), q, q**2]
+        _, left = _solve([a, v, sign, *weight], f)
+        _, left_of_magnitude = _solve([a * sign, np.abs(v), *weight], f)
+        explained = 1.0 - left / float(np.var(f))
+        if explained > best:
+            best, magnitude = explained, 1.0 - left_of_magnitude / float(np.var(f))
+    return best > _DIRECTED and 1.0 - best < _CLEARLY_LESS * (1.0 - magnitude)
 
 
 def _one(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.errors import InputError
+from jaxid.first_case.balance import has_direction
 from jaxid.first_case.words import FORCES, Meaning, meaning_of_joint
 from jaxid.logs.log import MINIMUM_SAMPLES
 from jaxid.logs.readers.dialect import split_unit
@@ -297,7 +298,9 @@ def _forces(
     ranked = sorted(known, key=_force_rank)
     usable = []
     for column in ranked:
-        doubt = _no_force(column, position.values())
+        joint = " ".join(column.meaning.joint)
+        moved = position.get(joint) or (next(iter(position.values())) if len(position) == 1 else None)
+        doubt = _no_force(column, moved)
         if doubt:
             said.append(f"'{column.name}' is passed over: {doubt}")
         else:
@@ -341,20 +344,21 @@ def _bare_command(column: Column, position: Mapping[str, Column]) -> bool:
     return not any(abs(correlation(column.values, p.values)) > _FOLLOWED for p in position.values())
 
 
-def _no_force(column: Column, position: object) -> str:
-    """Return why a column cannot be a force; empty if it can."""
+def _no_force(column: Column, position: Column | None) -> str:
+    """Return why a column cannot be the force that moves a position; empty if it can."""
     values = column.values
     if not values.any():
         return "it is zero throughout"
     if not column.moves:
         return ""
     low, high = float(values.min()), float(values.max())
-    magnitude = (
-        low >= 0 and low <= _NEAR_ZERO * high and column.meaning.quantity in ("load", "current", "duty")
-    )
-    if magnitude:
-        return "it is never negative, so it is a magnitude without a direction"
-    return ""
+    kind = column.meaning.quantity
+    if low < 0 or low > _NEAR_ZERO * high or kind not in ("load", "current", "duty"):
+        return ""
+    # The current of a drive that always holds a weight is never negative either. A servo's load is unsigned.
+    if kind != "load" and position is not None and has_direction(values, position.values):
+        return ""
+    return "it is never negative, so it is a magnitude without a direction"
 
 
 def _references(

@@ -1,10 +1,13 @@
 """Rough values from exact simulations and from curves of known coefficients."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from jaxid.first_case.balance import free_swing, rough_balance
+from jaxid.first_case.balance import free_swing, has_direction, rough_balance
 from truth.axis.machines import emps_like
+from truth.axis.slow_axis import slow_axis
 
 RATE = 1000.0
 
@@ -92,3 +95,15 @@ def test_what_does_not_swing():
     t = np.arange(3000) / RATE
     assert free_swing(0.5 * t**2, 1 / RATE) is None
     assert free_swing(np.exp(-t), 1 / RATE) is None
+
+
+def test_the_current_of_a_hoist_has_a_direction_and_a_magnitude_has_none():
+    level = slow_axis(0)
+    hoist = replace(level, machine=replace(level.machine, gravity_force=-180.0 * 9.81)).run()
+    # A brake holds the load at first.
+    held = np.where(np.arange(hoist["t"].size) < 50, 0.0, hoist["force"])
+    assert held.min() == 0
+    assert has_direction(held, hoist["position"])
+
+    run = level.run()
+    assert not has_direction(np.abs(run["force"]), run["position"])
