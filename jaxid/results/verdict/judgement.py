@@ -309,10 +309,12 @@ def _completeness_words(
         ]
     if complete is None:
         reason = next((r.reason for r in residuals if r.complete is None), doubt)
-        if not reason and search == "nothing_missing":
+        unexplained = not reason and search == "nothing_missing"
+        if unexplained:
             reason = "the residual is not quite noise, and no known effect accounts for it"
         return [
-            f"Whether the model is complete is not known: {reason or 'the log has no samples in motion'}."
+            f"Whether the model is complete is not known: {reason or 'the log has no samples in motion'}.",
+            *(_loop_words(session) if unexplained else []),
         ]
     worst = max((r for r in residuals if r.complete is False), key=_severity)
     what = {
