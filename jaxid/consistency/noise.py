@@ -20,6 +20,9 @@ from jaxid.simulation.sensor_noise import position_density
 _BEFORE, _AFTER = 8, 4
 # Samples of a log for each of these coefficients.
 _SAMPLES_EACH = 40
+# Readings of other rows say nothing of a force if that of the same row leaves less of it than this times what
+# all of them leave. All of them say something if they leave less of it by more than the second factor.
+_NO_MORE, _SOME = 1.1, 1.2
 # Part of the band of inverse dynamics in which its residual bounds the noise of the force.
 _BAND = (0.3, 0.8)
 # Fewest frequencies that give a median.
@@ -46,7 +49,7 @@ def estimated_force_noise(
 
     - the force in the high band that is no linear function of positions and reference around the sample. The
       rest comes from the controller, which differentiates the noise of its encoder: it is a force, and the
-      log has it exactly.
+      log has it exactly. If the loop is faster than the log, it is all of the high band.
     - the residual of inverse dynamics in the upper part of its band, position noise subtracted. It excludes a
       rough force that was commanded and logged exactly.
     - the high band of the logged force minus that of the declared control law, if that reproduces it.
@@ -63,11 +66,11 @@ def estimated_force_noise(
         law: Command of the declared control law at the logged readings, in units of the command; None: there
             is none that reproduces the logged one.
     """
-    bounds = [
-        _beyond_controller(machine, log),
-        _in_band(machine, log, data, fit),
-        signals.noise_within_stretches(log.force),
-    ]
+    beyond, faster_loop = _beyond_controller(machine, log)
+    in_band = _in_band(machine, log, data, fit)
+    # The high band has more frequencies than the band of a balance, and so the better estimate of one noise.
+    in_band = np.where(faster_loop & (beyond < _ALIKE * in_band), np.maximum(in_band, beyond), in_band)
+    bounds = [beyond, in_band, signals.noise_within_stretches(log.force)]
     if law is not None:
         bounds.append(signals.high_band_std(log.force - law))
     if data.recipe.median:
@@ -84,20 +87,35 @@ def _step(u: np.ndarray) -> float:
     return step if _LEVELS[0] <= levels <= _LEVELS[1] else 0.0
 
 
-def _beyond_controller(machine: Machine, log: Log) -> np.ndarray:
-    """Return the noise of each force in the high band, without its linear part in positions and reference."""
+def _beyond_controller(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Return the noise of each force beyond what a controller of the log's rate makes of its readings.
+
+    A controller of the log's rate differentiates the noise of its readings over rows, and the force that it
+    makes of it acts. In a log of a faster loop only the noise of the same row is in the force. It acts for a
+    tick, and the rows do not show the others: the whole high band is then noise of the force.
+
+    Returns:
+        The standard deviation in the high band, (m,), and whether the loop is faster than the log, (m,).
+    """
     driven = machine.plant.driven(machine.plant.joints)
-    out = np.empty(log.force.shape[1])
+    noise, faster = np.empty(log.force.shape[1]), np.zeros(log.force.shape[1], dtype=bool)
     for k, j in enumerate(driven):
         of = [log.readings[:, int(j)]]
         if log.reference is not None:
             of.append(log.reference[:, min(k, log.reference.shape[1] - 1)])
-        out[k] = _unexplained(log.force[:, k], of)
-    return out
+        noise[k], same_row, total = _unexplained(log.force[:, k], of)
+        faster[k] = same_row < _NO_MORE * noise[k] and total > _SOME * noise[k]
+        noise[k] = total if faster[k] else noise[k]
+    return noise, faster
 
 
-def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> float:
-    """Return the noise in the high band of a signal that no linear filter of others explains."""
+def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> tuple[float, float, float]:
+    """Return what other signals leave of the high band of a signal, as the deviation of a white noise.
+
+    Returns:
+        What no linear filter of all the others explains; what the first of them does not explain at the same
+        row; and the whole band.
+    """
     room = max(u.size // (_SAMPLES_EACH * len(of)), 1)
     share = min(1.0, room / (_BEFORE + _AFTER + 1))
     before, after = int(_BEFORE * share), int(_AFTER * share)
@@ -108,14 +126,24 @@ def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> float:
         return _high_band(shifted)
 
     target = spectra(u, range(1))
-    columns = np.concatenate([spectra(x, range(-after, before + 1)) for x in of], axis=1)
+    left = _left_by(target, np.concatenate([spectra(x, range(-after, before + 1)) for x in of], axis=1))
+    return left, _left_by(target, spectra(of[0], range(1))), _deviation(target)
+
+
+def _left_by(target: np.ndarray, columns: np.ndarray) -> float:
+    """Return the noise in a spectrum that no real combination of other spectra explains."""
     power = np.linalg.norm(columns, axis=0)
     columns = columns[:, power > 0] / power[power > 0]
 
     # Real coefficients for complex spectra: both parts are rows.
     rows, right = (np.concatenate([np.real(x), np.imag(x)]) for x in (columns, target))
     solved = np.linalg.lstsq(rows, right, rcond=1e-10)[0]
-    return float(np.sqrt(np.median(np.abs(target - columns @ solved) ** 2) / np.log(2.0)))
+    return _deviation(target - columns @ solved)
+
+
+def _deviation(spectrum: np.ndarray) -> float:
+    """Return the standard deviation of the white noise whose spectrum this is, without outliers."""
+    return float(np.sqrt(np.median(np.abs(spectrum) ** 2) / np.log(2.0)))
 
 
 def _high_band(x: Float[np.ndarray, "time k"]) -> np.ndarray:
@@ -184,7 +212,7 @@ def _force(
     if machine.sensor.force_noise is None:
         return []
     stated = np.broadcast_to(np.asarray(machine.sensor.force_noise), estimate.shape)
-    high, low = _beyond_controller(machine, log), _in_band(machine, log, data, fit)
+    high, low = _beyond_controller(machine, log)[0], _in_band(machine, log, data, fit)
     white = (high < _ALIKE * low) & (low < _ALIKE * high)
     findings = []
     for k, (of, found) in enumerate(zip(stated, estimate, strict=True)):

@@ -16,6 +16,7 @@ from jaxid.discovery.noise import NUMERICS
 from jaxid.discovery.selection import TIE_NATS
 from jaxid.logs.prepare import Prepared
 from jaxid.numerics.coloured_noise import NoiseModel
+from jaxid.simulation.sensor_noise import force_noise
 
 # An effect must close this part of the gap above the noise floor (in sum of squares, so about half of this
 # part in RMS), whatever its evidence: on measured data every effect helps a little.
@@ -70,8 +71,8 @@ class Acceptance:
     def __post_init__(self) -> None:
         self.domain: Domain = ForceDomain(self.superset)
         machine = self.superset.machine
-        force_std = machine.sensor.force_noise
-        noise = None if force_std is None else np.asarray(force_std) * machine.gain
+        std = force_noise(machine, self.data)
+        noise = std * machine.gain if np.any(std) else None
         self.samples: Any = cand.CandidateSamples(self.data, noise, self.view, self.more)
         views = self.validation_views or (None,) * len(self.validation)
         self.others: list[Any] = [

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.consistency.balance_fit import balance_fits
 from jaxid.gap import noise_floor
 from jaxid.session import Session, open_session
 from truth.axis.cases import case_text
@@ -70,6 +71,17 @@ def test_a_rough_command_that_is_logged_exactly_has_no_noise(loop, closed):
 def test_one_sample_in_ten_of_the_loop_is_enough():
     session = opened(setup(), every=10)
     assert floor(session) == pytest.approx(floor(session, NOISE), rel=0.2)
+
+
+@pytest.mark.parametrize("every", [4, 10])
+def test_what_a_faster_loop_makes_of_its_readings_is_noise_in_its_log(every):
+    """The rows show one tick of several; the floor is then what a complete model leaves."""
+    encoder = Sensor(position_resolution=1e-5, position_noise=5e-6, force_noise=0.1 * NOISE)
+    session = opened(dataclasses.replace(setup(), sensor=encoder), every=every)
+    machine, data = session.machine, session.fit.data
+    left = balance_fits(machine, data)[0].fit(bounded=False)[1][data.fitted]
+    assert floor(session) == pytest.approx(np.std(left), rel=0.15)
+    assert floor(session) > 1.2 * floor(session, 0.1 * NOISE)
 
 
 def test_a_random_command_is_no_noise():
