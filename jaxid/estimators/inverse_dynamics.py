@@ -24,7 +24,7 @@ from jaxid.model.plant import Plant
 from jaxid.model.unknowns import Free, scatter
 from jaxid.numerics.kept import kept_jit
 from jaxid.numerics.lanes import SolveRequest, Steps, run_alone
-from jaxid.numerics.misspecified import std_under_misspecification
+from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.precision import Precision, assess
 from jaxid.simulation.force_balance import ForceData, force_residual, sharpened, size_of_force
 
@@ -114,6 +114,8 @@ def inverse_dynamics_steps(
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = force_precision(machine, size, np.asarray(fit.theta), e, jacobian, rows)
+    if np.all(np.isfinite(jacobian)):
+        precision = precision.widened(widening(precision, jacobian, e, rows))
     converged = bool(fit.converged) and bool(np.all(np.isfinite(fit.theta)))
     return Estimate(
         method="inverse_dynamics",
