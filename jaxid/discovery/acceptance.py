@@ -31,6 +31,9 @@ _RARELY = 1e-3
 # by which the gap closes on the fitted log.
 _CONFIRMED = 0.1
 
+# Standard deviation of a force's drawn noise over that of the force, at least: so little meets no limit.
+_DRAWN = 1e-3
+
 # A mass of the machine, or another positive parameter of its plant, is next to nothing below this part of its
 # value without an effect.
 _NOTHING = 0.05
@@ -71,8 +74,10 @@ class Acceptance:
     def __post_init__(self) -> None:
         self.domain: Domain = ForceDomain(self.superset)
         machine = self.superset.machine
-        std = force_noise(machine, self.data)
-        noise = std * machine.gain if np.any(std) else None
+        # Any size does if none is stated; see `absorbed_noise`.
+        least = _DRAWN * np.std(self.data.force, axis=0)
+        std = force_noise(machine, self.data) * machine.gain
+        noise = std if self._states_noise else np.maximum(np.abs(std), least)
         self.samples: Any = cand.CandidateSamples(self.data, noise, self.view, self.more)
         views = self.validation_views or (None,) * len(self.validation)
         self.others: list[Any] = [
@@ -85,6 +90,11 @@ class Acceptance:
         self._numerics_of_joints = np.full(self.samples.moving.shape[1], np.max(self._numerics))
         self._numerics_of_joints[list(machine.plant.driven(machine.plant.joints))] = self._numerics
         self._noise = self.samples.moving.sum(axis=0) * np.square(self.floor)
+
+    @property
+    def _states_noise(self) -> bool:
+        """True if the case states the noise of the force."""
+        return self.superset.machine.sensor.force_noise is not None
 
     @property
     def _independent(self) -> float:
@@ -152,7 +162,7 @@ class Acceptance:
 
     def absorbed_noise(self, samples: Samples, old: np.ndarray, new: np.ndarray) -> float:
         """Return the part of the noise that a new model's drive filters out; see `absorbed_noise`."""
-        return absorbed_noise(self.domain, samples, self.colour, old, new)
+        return absorbed_noise(self.domain, samples, self.colour, old, new, stated=self._states_noise)
 
     def confirmed(
         self, old: np.ndarray, new: np.ndarray, *, drive: bool
@@ -284,20 +294,25 @@ def absorbed_noise(
     colour: tuple[NoiseModel, ...],
     old: np.ndarray,
     new: np.ndarray,
+    *,
+    stated: bool = True,
 ) -> float:
     """Return the part of the noise that the new model's drive filters out and the old one's does not.
 
     Noise of the logged force exists in the log only. A drive that filters the force filters that noise
-    too, and would gain by it without explaining anything.
+    too, and would gain by it without explaining anything. If the noise of the force is not stated, all that
+    the old model leaves may be such noise.
 
     Args:
         domain: Domain in which residuals are compared.
         samples: Samples of the log.
         colour: Noise expected from the sensors, by joint.
         old, new: All unknowns of the two models.
+        stated: Whether the case states the noise of the force.
 
     Returns:
-        Difference of the mean squares of whitened noise, at most 0.9.
+        Difference of the mean squares of whitened noise, at most 0.9; as a part of the first one if the noise
+        is not stated.
     """
     if not samples.noisier:
         return 0.0
@@ -307,4 +322,5 @@ def absorbed_noise(
         e, _ = domain.evaluate(samples, theta, ())
         noisier = domain.noisier(samples, theta)
         squares.append(float(np.mean(whitener((noisier - e)[..., None]) ** 2)))
-    return min(squares[0] - squares[1], 0.9)
+    absorbed = squares[0] - squares[1]
+    return min(absorbed if stated else absorbed / max(squares[0], 1e-300), 0.9)

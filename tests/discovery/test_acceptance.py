@@ -165,11 +165,14 @@ def test_a_lag_swallows_noise_of_the_force_and_a_delay_does_not(tmp_path):
     assert abs(swallowed[1]) < 0.01
 
 
-def test_nothing_is_known_to_be_swallowed_where_no_noise_is_stated(tmp_path):
+def test_all_may_be_noise_of_the_force_where_none_is_stated(tmp_path):
+    """A lag then swallows a part of the force's noise, although the log has hardly any."""
     session = opened(tmp_path, machines.emps_like(3, 1.0, 4.0), sensor=False)
     search = start_search(session)[1]
-    lagging = with_values(search, LAG, 0.02)
-    assert search.acceptance.absorbed_noise(search.samples, search.theta, lagging) == 0.0
+    lagging, delayed = with_values(search, LAG, 0.02), with_values(search, DELAY, 3e-3)
+    absorbed = [search.acceptance.absorbed_noise(search.samples, search.theta, t) for t in (lagging, delayed)]
+    assert absorbed[0] > 0.5
+    assert abs(absorbed[1]) < 0.01
 
 
 def test_models_are_as_far_apart_as_their_residuals_in_the_noise(axis):
