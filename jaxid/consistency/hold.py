@@ -57,18 +57,12 @@ def better_hold(
         falls most; None if the other hold is not clearly better, or the two cannot be compared.
     """
     holds = {"zero_order": "linear", "linear": "zero_order"}
-    # A drive with a delay or a lag shifts the force by itself.
-    shifts = any(e.delays_command() or not e.adds_force for e in machine.plant.effects)
-    if log.hold not in holds or shifts or not data.recipe.align_hold or not all(log.measured):
+    if log.hold not in holds or shifts_in_time(machine, data) or not all(log.measured):
         return None
     other = holds[log.hold]
     held = data.recipe.hold(replace(log, hold=other), machine.hold_period)
-    arrays = (ForceData.of(replace(data, hold=h)) for h in (data.hold, held))
-    now, then = (np.asarray(measured_force(machine.plant, a)) for a in arrays)
     wider = with_friction(fit)
-    residuals = [wider.fit(bounded=False)[1]]
-    moved = replace(wider, known=wider.known + now - then)
-    residuals.append(moved.fit(bounded=False)[1])
+    residuals = [wider.fit(bounded=False)[1], residual_held(machine, data, wider, held)]
 
     gaps = np.array([fit.rms(e) for e in residuals])
     driven = [int(j) for j in machine.plant.driven(machine.plant.joints)]
@@ -76,6 +70,28 @@ def better_hold(
     simpler = rival is not None and bool(np.all(gaps[1, driven] < _LESS * rival[driven]))
     better = simpler or clearly_better(residuals[1], residuals[0], fit)
     return (other, gaps[:, least]) if better else None
+
+
+def shifts_in_time(machine: Machine, data: Prepared) -> bool:
+    """Check whether a drive shifts its force in time, or the filter ignores for how long a force acts."""
+    drives = any(e.delays_command() or not e.adds_force for e in machine.plant.effects)
+    return drives or not data.recipe.align_hold
+
+
+def residual_held(
+    machine: Machine, data: Prepared, fit: BalanceFit, held: float
+) -> Float[np.ndarray, "kept n"]:
+    """Return the residual of a balance, fitted anew, if each force acts for another time.
+
+    Args:
+        machine: The machine.
+        data: The prepared log.
+        fit: Its balance.
+        held: Time for which each force acts [s]; zero: lines join them.
+    """
+    arrays = (ForceData.of(replace(data, hold=h)) for h in (data.hold, held))
+    now, then = (np.asarray(measured_force(machine.plant, a)) for a in arrays)
+    return replace(fit, known=fit.known + now - then).fit(bounded=False)[1]
 
 
 def clearly_better(
@@ -105,11 +121,11 @@ def clearly_smaller(
     gain = [piece.sum() for piece in np.array_split(more - less, _STRETCHES)]
     error = np.std(gain, ddof=1) / np.sqrt(len(gain))
     total = np.sqrt(less.sum() / max(more.sum(), 1e-300))
-    evidence = -_independent(residual, counts) * np.log(max(total, 1e-300))
+    evidence = -independent(residual, counts) * np.log(max(total, 1e-300))
     return bool(np.mean(gain) > _SURE * error and total < _CLEARLY and evidence > EVIDENCE)
 
 
-def _independent(residual: np.ndarray, counts: np.ndarray) -> float:
+def independent(residual: np.ndarray, counts: np.ndarray) -> float:
     """Return the number of samples with independent residuals, by the correlation of neighbours."""
     total = 0.0
     for e, counted in zip(residual.T, counts.T, strict=True):

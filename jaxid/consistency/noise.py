@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -36,14 +38,28 @@ _FACTOR = 3.0
 _ALIKE = 1.5
 
 
+class ForceNoise(NamedTuple):
+    """Noise of the logged forces.
+
+    Args:
+        std: Standard deviation of white noise of each force, in units of the command, (m,).
+        faster_loop: Whether a controller that is faster than the log made one of the forces.
+    """
+
+    std: Float[np.ndarray, " m"]
+    faster_loop: bool = False
+
+
 def estimated_force_noise(
     machine: Machine,
     log: Log,
     data: Prepared,
     fit: BalanceFit,
     law: Float[np.ndarray, "time m"] | None = None,
-) -> Float[np.ndarray, " m"]:
-    """Estimate the standard deviation of white noise of each logged force, in units of the command, (m,).
+    *,
+    fast: bool = False,
+) -> ForceNoise:
+    """Estimate the standard deviation of white noise of each logged force.
 
     Each of the following is an upper bound for it, and the lowest counts:
 
@@ -65,9 +81,10 @@ def estimated_force_noise(
         fit: Balance of the prepared log.
         law: Command of the declared control law at the logged readings, in units of the command; None: there
             is none that reproduces the logged one.
+        fast: Whether the loop is known to be faster than the log.
     """
-    beyond, faster_loop = _beyond_controller(machine, log)
-    in_band = _in_band(machine, log, data, fit)
+    beyond, faster_loop = _beyond_controller(machine, log, fast=fast)
+    in_band = noise_in_band(machine, log, data, fit.fit(bounded=False)[1], fit.counts)
     # The high band has more frequencies than the band of a balance, and so the better estimate of one noise.
     in_band = np.where(faster_loop & (beyond < _ALIKE * in_band), np.maximum(in_band, beyond), in_band)
     bounds = [beyond, in_band, signals.noise_within_stretches(log.force)]
@@ -78,7 +95,7 @@ def estimated_force_noise(
         bounds = [b if k == 1 else b / white for k, b in enumerate(bounds)]
     noise = np.min(bounds, axis=0)
     steps = np.array([_step(u) for u in log.force.T])
-    return np.maximum(noise, steps / np.sqrt(12))
+    return ForceNoise(np.maximum(noise, steps / np.sqrt(12)), bool(faster_loop.any()))
 
 
 def _step(u: np.ndarray) -> float:
@@ -87,7 +104,12 @@ def _step(u: np.ndarray) -> float:
     return step if _LEVELS[0] <= levels <= _LEVELS[1] else 0.0
 
 
-def _beyond_controller(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarray]:
+def loop_is_faster(machine: Machine, log: Log) -> bool:
+    """Check whether a controller that is faster than the log made a force, by its answer to noise."""
+    return bool(np.any(_beyond_controller(machine, log)[1]))
+
+
+def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Return the noise of each force beyond what a controller of the log's rate makes of its readings.
 
     A controller of the log's rate differentiates the noise of its readings over rows, and the force that it
@@ -104,7 +126,7 @@ def _beyond_controller(machine: Machine, log: Log) -> tuple[np.ndarray, np.ndarr
         if log.reference is not None:
             of.append(log.reference[:, min(k, log.reference.shape[1] - 1)])
         noise[k], same_row, total = _unexplained(log.force[:, k], of)
-        faster[k] = same_row < _NO_MORE * noise[k] and total > _SOME * noise[k]
+        faster[k] = fast or (same_row < _NO_MORE * noise[k] and total > _SOME * noise[k])
         noise[k] = total if faster[k] else noise[k]
     return noise, faster
 
@@ -156,19 +178,32 @@ def _high_band(x: Float[np.ndarray, "time k"]) -> np.ndarray:
     return spectrum[(f > 0.3) & (f < 0.475)] / np.linalg.norm(window)
 
 
-def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.ndarray:
-    """Return the white noise of each force that the residual of inverse dynamics allows; inf if unknown."""
+def noise_in_band(
+    machine: Machine,
+    log: Log,
+    data: Prepared,
+    residual: Float[np.ndarray, "kept n"],
+    counts: Bool[np.ndarray, "kept n"],
+) -> Float[np.ndarray, " m"]:
+    """Return the white noise of each force that the residual of inverse dynamics allows; inf if unknown.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        data: The prepared log.
+        residual: Force residual of the best balance.
+        counts: Mask of the samples that count.
+    """
     out = np.full(log.force.shape[1], np.inf)
     if not all(log.measured):
         return out
-    residual = fit.fit(bounded=False)[1]
     rate = log.rate_hz / data.recipe.decimation
     top = data.recipe.edge * log.rate_hz / 2 if data.recipe.edge else data.recipe.band_hz(log.rate_hz)
     top = min(top, 0.5 * rate)
     f_all, of_position = position_density(machine, log, data)
     for k, joint in enumerate(machine.plant.driven(machine.plant.joints)):
         j = int(joint)
-        f, power = _periodogram(residual[:, j], fit.counts[:, j], rate)
+        f, power = _periodogram(residual[:, j], counts[:, j], rate)
         band = (f > _BAND[0] * top) & (f < _BAND[1] * top)
         if band.sum() < _FREQUENCIES or machine.gain[k] == 0:
             continue
@@ -199,7 +234,7 @@ def noise_findings(
         log: The log.
         data: The prepared log.
         fit: Balance of the prepared log.
-        estimate: Result of `estimated_force_noise`.
+        estimate: Standard deviations by `estimated_force_noise`, (m,).
     """
     of_position = [] if log.integrated else _position(machine, log)
     return [*_force(machine, log, data, fit, estimate), *of_position]
@@ -212,7 +247,10 @@ def _force(
     if machine.sensor.force_noise is None:
         return []
     stated = np.broadcast_to(np.asarray(machine.sensor.force_noise), estimate.shape)
-    high, low = _beyond_controller(machine, log)[0], _in_band(machine, log, data, fit)
+    high, low = (
+        _beyond_controller(machine, log)[0],
+        noise_in_band(machine, log, data, fit.fit(bounded=False)[1], fit.counts),
+    )
     white = (high < _ALIKE * low) & (low < _ALIKE * high)
     findings = []
     for k, (of, found) in enumerate(zip(stated, estimate, strict=True)):

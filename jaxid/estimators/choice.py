@@ -80,12 +80,19 @@ def choose_method(session: Session, asked: str | None = None, *, curvature: bool
         long = "a filter along the log of such a plant takes long"
     elif (samples := sum(run.log.samples for run in session.fits)) > _LONG:
         long = f"a filter along {samples} samples takes long"
-    if long and (curvature or case.identification.hessian or case.identification.profile):
+    asks_likelihood = curvature or case.identification.hessian or bool(case.identification.profile)
+    if long and asks_likelihood:
         return Choice(
             "output_error", f"{long}, and inverse_dynamics has no likelihood with a Hessian or profile"
         )
     if long:
         return Choice("inverse_dynamics", long)
+
+    if all(log.measured) and any(run.data.faster_loop for run in session.fits) and not asks_likelihood:
+        return Choice(
+            "inverse_dynamics",
+            "the loop is faster than the log: a force between two rows is not known, its mean over many is",
+        )
 
     how = "open loop and feedback are one case" if controller is None else "the log holds the command"
     if not np.all(log.measured):

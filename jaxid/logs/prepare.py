@@ -160,6 +160,7 @@ class Prepared:
             `jaxid.dynamics.hidden_joints`).
         force_noise: Estimated standard deviation of the logged force, in units of the command, (m,); None:
             not estimated.
+        faster_loop: Whether the log shows that a controller that is faster than its rows made the force.
         high_band: Noise of the force in its high band, as it was logged, (m,); None: that of the log. See
             `jaxid.simulation.sensor_noise.high_band_force_noise`.
     """
@@ -178,6 +179,7 @@ class Prepared:
     measured: tuple[bool, ...] = (True,)
     steps: int = 1
     force_noise: Float[np.ndarray, " m"] | None = None
+    faster_loop: bool = False
     high_band: Float[np.ndarray, " m"] | None = None
 
     @property

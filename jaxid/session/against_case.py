@@ -12,13 +12,14 @@ from jaxid.consistency.balance_fit import BalanceFit, balance_fits
 from jaxid.consistency.clipped import clipped_force
 from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
 from jaxid.consistency.law import law_findings, loop_velocity_findings, replayed_law
-from jaxid.consistency.noise import estimated_force_noise, noise_findings
+from jaxid.consistency.noise import ForceNoise, estimated_force_noise, loop_is_faster, noise_findings
 from jaxid.consistency.reference_hold import (
     compare_reference_holds,
     reference_hold_finding,
     reference_hold_setting,
 )
 from jaxid.consistency.sign import sign_findings
+from jaxid.consistency.tick import faster_tick
 from jaxid.consistency.timing import timing_findings
 from jaxid.consistency.weight import weight_findings
 from jaxid.logs.soundness import Finding, raise_on_error
@@ -35,17 +36,19 @@ class AgainstCase:
         findings: Warnings.
         hold: Hold of the force to take in place of the log's; None: the log's.
         reference_hold: Course of the reference between samples.
-        force_noise: Estimated noise of the force, in units of the command, (m,).
+        force_noise: Estimated noise of the force.
         settings: Choices made from the log; see `Session`.
         clipped: Rows in which the recording of a force is clipped, (samples, drives); None: none.
+        held: Time for which each force acts, if it is less than a row [s]; None: it is not.
     """
 
     findings: list[Finding]
     hold: str | None
     reference_hold: str
-    force_noise: np.ndarray
+    force_noise: ForceNoise
     settings: dict[str, dict[str, str]]
     clipped: np.ndarray | None = None
+    held: float | None = None
 
 
 def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold: bool) -> AgainstCase:
@@ -63,10 +66,10 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
     log, data = opened.log, opened.data
     if log.passive:
         # Sign, hold and noise of a force, and a law, need a force.
-        return AgainstCase([], None, machine.reference_hold, np.zeros(log.force.shape[1]), {})
+        return AgainstCase([], None, machine.reference_hold, ForceNoise(np.zeros(log.force.shape[1])), {})
     declared = balance_fits(machine, data)[0]
     if not declared.finite:
-        return AgainstCase([], None, machine.reference_hold, np.zeros(log.force.shape[1]), {})
+        return AgainstCase([], None, machine.reference_hold, ForceNoise(np.zeros(log.force.shape[1])), {})
     gain = None
     if case.actuator.transmission is None and case.actuator.torque_constant is None:
         gain = drives_of_case(case, machine.plant).gain.tolist()
@@ -93,6 +96,15 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
             log, data = opened.log, opened.data
             declared = balance_fits(machine, data)[0]
 
+    tick = None
+    if free_hold:
+        tick = faster_tick(machine, log, data, declared, fast=loop_is_faster(machine, log))
+    if tick is not None:
+        findings.append(tick.finding(log))
+        settings["tick"] = tick.setting()
+        data = replace(data, hold=tick.period)
+        declared = balance_fits(machine, data)[0]
+
     if better is None or free_hold:  # a wrong hold is half a sample late
         findings += timing_findings(machine, log, data, declared)
     confirmed = False
@@ -106,10 +118,11 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
 
     findings += weight_findings(machine, log, declared)
     made = replayed.command if replayed is not None and replayed.exact else None
-    noise = estimated_force_noise(machine, log, data, declared, made)
-    findings += noise_findings(machine, log, data, declared, noise)
+    noise = estimated_force_noise(machine, log, data, declared, made, fast=tick is not None)
+    findings += noise_findings(machine, log, data, declared, noise.std)
     left_out = None if clipped is None else clipped[0]
-    return AgainstCase(findings, hold, machine.reference_hold, noise, settings, left_out)
+    held = None if tick is None else tick.period
+    return AgainstCase(findings, hold, machine.reference_hold, noise, settings, left_out, held)
 
 
 def _with_reference_hold(

@@ -11,6 +11,7 @@ from jaxtyping import Bool
 
 from jaxid.build import build_machine
 from jaxid.case.case import Case, CaseLike, load_case
+from jaxid.consistency.noise import ForceNoise
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
@@ -271,8 +272,11 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
         session = session_under_hold(session, found.hold)
     machine, opened, more = session.machine, [session.fit, *session.validations], list(session.more)
 
-    # The logs to validate on are of the same sensors.
+    # The logs to validate on are of the same sensors and the same loop.
     opened = [_with_force_noise(run, found.force_noise) for run in opened]
+    if found.held is not None:
+        opened = [replace(run, data=replace(run.data, hold=found.held)) for run in opened]
+        session = replace(session, chooses_hold=False)
     findings = [*session.findings, *found.findings]
     for k, run in enumerate(more):
         # A further log to fit counts by its own noise.
@@ -311,8 +315,9 @@ def _without_clipped(session: Session, rows: Bool[np.ndarray, "samples m"]) -> S
     return replace(session, fit=without_clipped(session.fit, rows, machine), validations=validations)
 
 
-def _with_force_noise(opened: OpenedLog, noise: np.ndarray | None) -> OpenedLog:
-    return replace(opened, data=replace(opened.data, force_noise=noise))
+def _with_force_noise(opened: OpenedLog, noise: ForceNoise) -> OpenedLog:
+    data = replace(opened.data, force_noise=noise.std, faster_loop=noise.faster_loop)
+    return replace(opened, data=data)
 
 
 def _with_unknowns_by_log(case: Case, machine: Machine, sources: Sequence[Source]) -> Machine:
@@ -354,7 +359,9 @@ def open_another(session: Session, log: LogLike) -> OpenedLog:
     name, needed = Path(measured.source).stem, 0 if short else enough(machine)
     values = OwnValues(name) if session.more else None
     opened = open_log(name, measured, machine, session.recipe, needed, machine.disturbance, values=values)
-    opened = _with_force_noise(opened, session.fit.data.force_noise)
+    known = session.fit.data
+    data = replace(opened.data, force_noise=known.force_noise, faster_loop=known.faster_loop)
+    opened = replace(opened, data=data)
     return opened if opened.log.hold == machine.hold else under_hold(machine.hold, opened, machine)
 
 

@@ -1,0 +1,105 @@
+"""Tick of a loop that is faster than its log, by the time for which each force seems to be held."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.consistency.balance_fit import BalanceFit
+from jaxid.consistency.hold import independent, residual_held, shifts_in_time, with_friction
+from jaxid.consistency.noise import noise_in_band
+from jaxid.logs.finding import Finding
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import Prepared
+from jaxid.machine import Machine
+from jaxid.simulation.sensor_noise import noise_density
+
+# Ticks in a row of the log that are tried.
+_TICKS = tuple(range(2, 11))
+# Gain in log-likelihood over a force that is held for a row, and over lines, from which a tick is taken.
+_EVIDENCE = 8.0
+# A tick is taken for a model that leaves little more than noise: what is missing may shift a force in time.
+_NOISE = 1.3
+
+
+class Tick(NamedTuple):
+    """Time for which each force acts in the log of a faster loop.
+
+    Args:
+        period: The time [s].
+        evidence: Gain in log-likelihood over lines and over a force that is held for a row [nats]; None: the
+            log shows that the loop is faster, and its noise leaves the time uncertain.
+    """
+
+    period: float
+    evidence: float | None
+
+    def finding(self, log: Log) -> Finding:
+        """Return the note on it."""
+        acts = f"each force seems to act for {1e3 * self.period:.2g} ms"
+        what = f"the loop is faster than the log: {acts}, and those between the rows are not in the log"
+        return Finding("warning", what, f"{log.source}, force", "log every tick of the loop if you can")
+
+    def setting(self) -> dict[str, str]:
+        """Return the entry of `settings` in result.json."""
+        if self.evidence is None:
+            reason = "the force answers to the noise of its own row's reading only, as that of a faster loop"
+        else:
+            reason = f"it raises the log-likelihood by {self.evidence:.3g} over held forces and over lines"
+        return {"value": f"{self.period:.3g} s", "reason": reason}
+
+
+def faster_tick(
+    machine: Machine, log: Log, data: Prepared, fit: BalanceFit, *, fast: bool = False
+) -> Tick | None:
+    """Return the time for which each force acts if it is less than a row of the log; None if it is not.
+
+    A force that is held for h acts h/2 later than lines between its values do. Of a loop of the log's rate h
+    is a row; of a faster one the log has every second or third force only, each of which acts for a part of
+    the row. The times are compared as in `better_hold`.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        data: The prepared log.
+        fit: Its balance.
+        fast: Whether the loop is known to be faster. The time is then the mean over those that are possible,
+            weighted by their likelihood.
+    """
+    if machine.controller is not None or log.hold == "band_limited" or shifts_in_time(machine, data):
+        return None
+    if not all(log.measured) or not fit.finite:
+        return None
+    wider = with_friction(fit)
+
+    def residual(held: float) -> Float[np.ndarray, "kept n"]:
+        return residual_held(machine, data, wider, held)
+
+    def cost(held: float) -> float:
+        return max(float(np.linalg.norm(fit.rms(residual(held)) / fit.scale)), 1e-300)
+
+    # Plain numbers: a hold is static in compiled code.
+    times = [log.period / rows for rows in _TICKS]
+    costs = np.array([cost(held) for held in times])
+    best = int(np.argmin(costs))
+    left = residual(times[best])
+    count = independent(left / fit.scale, fit.counts)
+    lines, row = cost(0.0), cost(log.period)
+    evidence = count * float(np.log(min(lines, row) / costs[best]))
+    if fast and evidence < _EVIDENCE:
+        weights = (np.append(costs, lines) / costs[best]) ** -count
+        return Tick(float([*times, 0.0] @ weights / weights.sum()), None)
+    if evidence < _EVIDENCE:
+        return None
+
+    held = replace(data, hold=times[best])
+    noise = noise_in_band(machine, log, held, left, fit.counts)
+    if not np.all(np.isfinite(noise)):
+        return None
+    f, power = noise_density(machine, log, held, noise)
+    floor = np.sqrt(np.trapezoid(power, f, axis=0))
+    complete = fast or np.all(fit.rms(left) <= _NOISE * floor)
+    return Tick(times[best], evidence) if complete else None
