@@ -159,9 +159,12 @@ class Case:
         from jaxid.effects import EFFECTS
 
         asked = {*self.kinds, *(cls.kind for cls in self.candidates)}
-        registered = [
-            cls for kind, cls in EFFECTS.items() if kind in asked or not (self.kinds or cls.on_request)
-        ]
+        links = self.plant.cls.links(self.plant.joints) > 0
+
+        def by_default(cls: type[Effect]) -> bool:
+            return not (self.kinds or cls.on_request or (links and cls.in_links))
+
+        registered = [cls for kind, cls in EFFECTS.items() if kind in asked or by_default(cls)]
         return (*registered, *self.own_effects)
 
     @property

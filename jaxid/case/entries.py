@@ -321,8 +321,9 @@ def search_keys(root: Spot, kinds: Kinds) -> dict[str, Key]:
 
     def candidate(value: Any, spot: Spot) -> type[Effect]:
         kind = text(value, spot)
-        if kind in effects and (effects[kind].on_request or effects[kind].without_force_on_request):
-            return effects[kind]
+        found = effects.get(kind)
+        if found and (found.on_request or found.without_force_on_request or found.in_links):
+            return found
         if kind in effects:
             raise spot.refuse(kind, "takes part in every search", "leave it out")
         kinds.need_classes()

@@ -30,6 +30,7 @@ _OF_PLANTS = ("linked", "usual_motion", "passives", "tools", "actuated")
 _OF_EFFECTS = (
     "on_request",
     "without_force_on_request",
+    "in_links",
     "with_springs",
     "of_spring",
     "in_drive",

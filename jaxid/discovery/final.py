@@ -11,6 +11,7 @@ from jaxid.discovery.result import NamedEffect
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Search, Step
 from jaxid.machine import Machine
+from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import free_effect
 
 
@@ -24,12 +25,25 @@ def machine_with(
     plant, parameters = machine.plant, machine.parameters
     values, names = [*theta[superset.base]], []
     for c in added:
-        effect = cand.effect_at(superset, c, theta[c.index])
-        plant, free = free_effect(plant, effect, machine.units)
+        own = _within_half_a_turn(superset, c, theta[c.index])
+        plant, free = free_effect(plant, cand.effect_at(superset, c, own), machine.units)
         parameters = parameters.extended(free)
-        values.extend(theta[c.index])
+        values.extend(own)
         names.append(tuple(f.name for f in free))
     return machine.with_plant(plant, parameters).with_estimate(np.asarray(values)), names
+
+
+def _within_half_a_turn(
+    superset: cand.CandidateModel, candidate: cand.Candidate, values: np.ndarray
+) -> np.ndarray:
+    """Return values of an effect with its angles between -pi and pi: a phase is the same after a turn."""
+    infos, out = parameters_of(type(cand.effect_of(superset, candidate))), values.copy()
+    for k, i in enumerate(candidate.index):
+        free = superset.machine.parameters.free[i]
+        moved = values[k] - 2 * np.pi * np.round(values[k] / (2 * np.pi))
+        if infos[str(free.path[-1])].dimension == "angle" and free.lower <= moved <= free.upper:
+            out[k] = moved
+    return out
 
 
 def final_machine(

@@ -102,8 +102,7 @@ class Unbalance(Effect):
     without_force = True
 
     of_rotary = True
-    # A search by default would have to tell it from a ripple of one period a turn.
-    on_request = True
+    in_links = True
 
     moment: Array = parameter("moment", "nonnegative", "m r, mass times distance from the axis")
     phase: Array = parameter("angle", "free", "of the mass above the horizontal at q = 0")

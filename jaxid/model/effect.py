@@ -208,6 +208,9 @@ class Effect(eqx.Module):
     # Whether a search tries it only if [discover] requests it; otherwise it would replace a simpler effect.
     on_request: ClassVar[bool] = False
 
+    # Whether a plant with links has it by their masses: a search there tries it on request only.
+    in_links: ClassVar[bool] = False
+
     # Properties that shared code needs from effects of every kind. The first five name a parameter, or are
     # None if the effect has no such parameter.
     # Level of dry friction while sliding (Coulomb's, LuGre's).
