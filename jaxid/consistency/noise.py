@@ -44,10 +44,13 @@ class ForceNoise(NamedTuple):
     Args:
         std: Standard deviation of white noise of each force, in units of the command, (m,).
         faster_loop: Whether a controller that is faster than the log made one of the forces.
+        answer: Answer of each force to the noise of its own row's reading, in units of the command per m or
+            rad, (m,); zero where the loop is not faster; None: none has one.
     """
 
     std: Float[np.ndarray, " m"]
     faster_loop: bool = False
+    answer: Float[np.ndarray, " m"] | None = None
 
 
 def estimated_force_noise(
@@ -83,7 +86,7 @@ def estimated_force_noise(
             is none that reproduces the logged one.
         fast: Whether the loop is known to be faster than the log.
     """
-    beyond, faster_loop = _beyond_controller(machine, log, fast=fast)
+    beyond, faster_loop, answer = _beyond_controller(machine, log, fast=fast)
     in_band = noise_in_band(machine, log, data, fit.fit(bounded=False)[1], fit.counts)
     # The high band has more frequencies than the band of a balance, and so the better estimate of one noise.
     in_band = np.where(faster_loop & (beyond < _ALIKE * in_band), np.maximum(in_band, beyond), in_band)
@@ -95,7 +98,8 @@ def estimated_force_noise(
         bounds = [b if k == 1 else b / white for k, b in enumerate(bounds)]
     noise = np.min(bounds, axis=0)
     steps = np.array([_step(u) for u in log.force.T])
-    return ForceNoise(np.maximum(noise, steps / np.sqrt(12)), bool(faster_loop.any()))
+    found = ForceNoise(np.maximum(noise, steps / np.sqrt(12)), bool(faster_loop.any()))
+    return found._replace(answer=answer) if answer.any() else found
 
 
 def _step(u: np.ndarray) -> float:
@@ -109,7 +113,9 @@ def loop_is_faster(machine: Machine, log: Log) -> bool:
     return bool(np.any(_beyond_controller(machine, log)[1]))
 
 
-def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def _beyond_controller(
+    machine: Machine, log: Log, *, fast: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the noise of each force beyond what a controller of the log's rate makes of its readings.
 
     A controller of the log's rate differentiates the noise of its readings over rows, and the force that it
@@ -117,26 +123,30 @@ def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False) -> tup
     tick, and the rows do not show the others: the whole high band is then noise of the force.
 
     Returns:
-        The standard deviation in the high band, (m,), and whether the loop is faster than the log, (m,).
+        The standard deviation in the high band, whether the loop is faster than the log, and the answer of
+        the force to the noise of its row where that shows it, (m,) each.
     """
     driven = machine.plant.driven(machine.plant.joints)
     noise, faster = np.empty(log.force.shape[1]), np.zeros(log.force.shape[1], dtype=bool)
+    answers = np.zeros(log.force.shape[1])
     for k, j in enumerate(driven):
         of = [log.readings[:, int(j)]]
         if log.reference is not None:
             of.append(log.reference[:, min(k, log.reference.shape[1] - 1)])
-        noise[k], same_row, total = _unexplained(log.force[:, k], of)
-        faster[k] = fast or (same_row < _NO_MORE * noise[k] and total > _SOME * noise[k])
+        noise[k], same_row, total, answer = _unexplained(log.force[:, k], of)
+        shown = same_row < _NO_MORE * noise[k] and total > _SOME * noise[k]
+        faster[k] = fast or shown
+        answers[k] = answer if shown else 0.0
         noise[k] = total if faster[k] else noise[k]
-    return noise, faster
+    return noise, faster, answers
 
 
-def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> tuple[float, float, float]:
+def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> tuple[float, float, float, float]:
     """Return what other signals leave of the high band of a signal, as the deviation of a white noise.
 
     Returns:
         What no linear filter of all the others explains; what the first of them does not explain at the same
-        row; and the whole band.
+        row; the whole band; and the factor from the first one to the signal.
     """
     room = max(u.size // (_SAMPLES_EACH * len(of)), 1)
     share = min(1.0, room / (_BEFORE + _AFTER + 1))
@@ -148,19 +158,21 @@ def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> tuple[float, float, flo
         return _high_band(shifted)
 
     target = spectra(u, range(1))
-    left = _left_by(target, np.concatenate([spectra(x, range(-after, before + 1)) for x in of], axis=1))
-    return left, _left_by(target, spectra(of[0], range(1))), _deviation(target)
+    around = np.concatenate([spectra(x, range(-after, before + 1)) for x in of], axis=1)
+    left, _ = _left_by(target, around)
+    same_row, factor = _left_by(target, spectra(of[0], range(1)))
+    return left, same_row, _deviation(target), float(factor[0])
 
 
-def _left_by(target: np.ndarray, columns: np.ndarray) -> float:
-    """Return the noise in a spectrum that no real combination of other spectra explains."""
+def _left_by(target: np.ndarray, columns: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the noise in a spectrum that no real combination of others explains, and the combination."""
     power = np.linalg.norm(columns, axis=0)
-    columns = columns[:, power > 0] / power[power > 0]
+    scaled = columns / np.where(power > 0, power, 1.0)
 
     # Real coefficients for complex spectra: both parts are rows.
-    rows, right = (np.concatenate([np.real(x), np.imag(x)]) for x in (columns, target))
+    rows, right = (np.concatenate([np.real(x), np.imag(x)]) for x in (scaled, target))
     solved = np.linalg.lstsq(rows, right, rcond=1e-10)[0]
-    return _deviation(target - columns @ solved)
+    return _deviation(target - scaled @ solved), solved[:, 0] / np.where(power > 0, power, 1.0)
 
 
 def _deviation(spectrum: np.ndarray) -> float:

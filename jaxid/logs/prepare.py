@@ -161,6 +161,8 @@ class Prepared:
         force_noise: Estimated standard deviation of the logged force, in units of the command, (m,); None:
             not estimated.
         faster_loop: Whether the log shows that a controller that is faster than its rows made the force.
+        answer: Answer of each force to the noise of the reading of its row, in units of the command per m or
+            rad, (m,), if that loop is faster; None: there is none.
         high_band: Noise of the force in its high band, as it was logged, (m,); None: that of the log. See
             `jaxid.simulation.sensor_noise.high_band_force_noise`.
     """
@@ -180,6 +182,7 @@ class Prepared:
     steps: int = 1
     force_noise: Float[np.ndarray, " m"] | None = None
     faster_loop: bool = False
+    answer: Float[np.ndarray, " m"] | None = None
     high_band: Float[np.ndarray, " m"] | None = None
 
     @property

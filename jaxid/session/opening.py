@@ -316,7 +316,7 @@ def _without_clipped(session: Session, rows: Bool[np.ndarray, "samples m"]) -> S
 
 
 def _with_force_noise(opened: OpenedLog, noise: ForceNoise) -> OpenedLog:
-    data = replace(opened.data, force_noise=noise.std, faster_loop=noise.faster_loop)
+    data = replace(opened.data, force_noise=noise.std, faster_loop=noise.faster_loop, answer=noise.answer)
     return replace(opened, data=data)
 
 
@@ -360,7 +360,12 @@ def open_another(session: Session, log: LogLike) -> OpenedLog:
     values = OwnValues(name) if session.more else None
     opened = open_log(name, measured, machine, session.recipe, needed, machine.disturbance, values=values)
     known = session.fit.data
-    data = replace(opened.data, force_noise=known.force_noise, faster_loop=known.faster_loop)
+    data = replace(
+        opened.data,
+        force_noise=known.force_noise,
+        faster_loop=known.faster_loop,
+        answer=known.answer,
+    )
     opened = replace(opened, data=data)
     return opened if opened.log.hold == machine.hold else under_hold(machine.hold, opened, machine)
 

@@ -58,7 +58,8 @@ def position_density(
     """Compute the one-sided density of the force that position noise alone causes [N^2/Hz], by joint.
 
     The noise passes the plant's impedance -M w^2 + i C w + K (linearised at a typical velocity), the response
-    of each derivative and the parallel filter. Noise of a measured velocity counts as that of its integral.
+    of each derivative and the parallel filter. Noise of a measured velocity counts as that of its integral. A
+    force that answers to the noise of its row's reading, as in the log of a faster loop, is a part of it.
 
     Args:
         machine: The machine; its parameters enter through the impedance only.
@@ -82,6 +83,10 @@ def position_density(
     through = recipe.decimator.response(f, rate)
     if log.integrated:
         through = through / w[:, 0, 0]
+    if data.answer is not None:
+        # The force, which is subtracted, answers to the same noise.
+        each = np.asarray(machine.plant.applied(jnp.asarray(data.answer * machine.gain), len(mass)))
+        impedance = impedance - np.diag(each)
     density = 2 * np.square(np.broadcast_to(sigma, (len(mass),))) / rate
     return f, np.einsum("fij,j->fi", np.abs(impedance) ** 2, density) * through[:, None] ** 2
 
@@ -111,6 +116,10 @@ def noise_density(
     std = force_noise(machine, data)
     if force_std is not None and machine.sensor.force_noise is None:
         std = force_std
+    if data.answer is not None:
+        driven = list(machine.plant.driven(machine.plant.joints))
+        answer = data.answer * position_noise(machine, log)[driven]
+        std = np.sqrt(np.maximum(np.square(std) - np.square(answer), 0.0))
     if np.any(std):
         by_drive = jnp.asarray(2 * np.square(std * machine.gain) / log.rate_hz)
         white = np.asarray(machine.plant.applied(by_drive, power.shape[1]))
