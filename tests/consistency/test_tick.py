@@ -1,6 +1,5 @@
 """Tick of a loop that is faster than its log, on exact logs of every tick, and of every second or third."""
 
-import dataclasses
 import tomllib
 
 import numpy as np
@@ -9,23 +8,11 @@ import pytest
 import jaxid
 from jaxid.session import Session, open_session
 from truth.axis.cases import case_text
-from truth.axis.machines import Setup, moves
-from truth.axis.stepper import Loop, Machine, Sensor
+from truth.axis.machines import Setup
+from truth.axis.slow_logs import RATE, robot_joint, with_hidden
 
-RATE, SECONDS = 1000.0, 20.0
-TIME = np.arange(round(RATE * SECONDS)) / RATE
-EFFECTS = {"viscous_friction": {"coefficient": 2.0}, "coulomb_friction": {"level": 3.0}}
-COUNT = 2 * np.pi / 2**18
-# A robot's joint: 0.8 kg m^2, 10 N m/A behind its gear.
-REFERENCE = moves(TIME, [0.0, 0.1, -0.2, 0.7, -0.6], [0.1, 0.4, 0.9, 1.2, 0.8], 4.0, rest=0.1)
-SETUP = Setup(
-    Machine(0.8, EFFECTS, actuator_gain=10.0),
-    Loop(kind="cascade_pd", kp=25.0, kv=3.0, velocity_average=2, limit=20.0, reference=REFERENCE),
-    Sensor(COUNT, 0.5 * COUNT, 0.005),
-    RATE,
-    SECONDS,
-    5,
-)
+SETUP = robot_joint(0)[0]
+EFFECTS = SETUP.machine.effects
 
 
 def opened(every: int, of: Setup = SETUP, more: str = "") -> Session:
@@ -60,8 +47,7 @@ def test_a_stated_hold_is_kept():
 
 def test_what_is_missing_is_no_tick():
     """A rough model leaves a residual in which any shift in time may help."""
-    weak = {**EFFECTS, "stribeck_friction": {"level": 2.0, "velocity": 0.06}}
-    session = opened(2, dataclasses.replace(SETUP, machine=Machine(0.8, weak, actuator_gain=10.0)))
+    session = opened(2, with_hidden(SETUP, "stribeck_friction"))
     assert "tick" not in session.settings
 
 
@@ -75,4 +61,5 @@ def test_values_of_every_second_tick_hold_and_nothing_is_missing():
     assert any("faster than the log" in note for note in found.estimate.notes)
     fit = found.estimate
     assert tuple(fit.names) == ("inertia", "viscous_friction.coefficient", "coulomb_friction.level")
-    assert np.all(np.abs(fit.theta - [0.8, 2.0, 3.0]) < 3 * fit.std)
+    frictions = (EFFECTS["viscous_friction"]["coefficient"], EFFECTS["coulomb_friction"]["level"])
+    assert np.all(np.abs(fit.theta - [SETUP.machine.inertia, *frictions]) < 3 * fit.std)

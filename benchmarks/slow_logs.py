@@ -1,0 +1,124 @@
+"""Joints whose loop is faster than their log: effects that `discover` names, hidden ones and none.
+
+    python -m benchmarks.slow_logs [--runs N] [--first SEED] [-o DIR]
+
+Each seed is one joint (`truth/axis/slow_logs.py`), searched complete and with each effect hidden. The case
+states neither controller nor sensor. Runs are written to DIR/slow_logs.jsonl as they end; a second call goes
+on from there, and rewrites the table DIR/slow_logs.md from all of them.
+"""
+
+import argparse
+import sys
+import time
+import tomllib
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom
+
+import jaxid
+from benchmarks.stored_runs import append_runs, commit_of, read_runs
+from truth.axis.cases import case_text
+from truth.axis.slow_logs import HIDDEN, robot_joint, visible, with_hidden
+
+HERE = Path(__file__).parent / "results"
+NONE = "none"
+# Gain of the oracle from which an effect counts as visible [nats].
+_VISIBLE = 30.0
+
+
+def run(seed: int, kind: str, commit: str) -> dict[str, Any]:
+    """Search one joint, and return the record."""
+    setup, rate = robot_joint(seed)
+    declared = tuple(setup.machine.effects.items())
+    if kind != NONE:
+        setup = with_hidden(setup, kind)
+    log = setup.run(log_rate=rate)
+    case = tomllib.loads(case_text(setup, declared, motion="rotary", sensor=False, closed=False))
+    begin = time.perf_counter()
+    found = jaxid.discover(case, {"t": log["t"], "q": log["position"], "u": log["force"]})
+    truth = {"inertia": setup.machine.inertia}
+    truth |= {f"{k}.{name}": value for k, of in setup.machine.effects.items() for name, value in of.items()}
+    fit = found.estimate
+    columns = zip(fit.names, fit.theta, fit.std, fit.identifiable, strict=True)
+    return {
+        "seed": seed,
+        "hidden": kind,
+        "rate": rate,
+        "oracle": None if kind == NONE else visible(setup, log, kind),
+        "verdict": found.verdict,
+        "complete": found.model_complete,
+        "named": list(found.kinds),
+        "z": {n: float((value - truth[n]) / std) for n, value, std, ok in columns if ok and n in truth},
+        "seconds": time.perf_counter() - begin,
+        "commit": commit,
+    }
+
+
+def table(records: list[dict[str, Any]]) -> str:
+    """Return the table as Markdown."""
+    commits = ", ".join(sorted({r["commit"] for r in records}))
+    lines = [
+        "# Joints whose loop is faster than their log, by the exact stepper",
+        "",
+        f"Written by `python -m benchmarks.slow_logs` on {date.today()}, at {commits}.",
+        "Loops of 1 kHz, logs of 100 to 500 Hz with a force; encoders of 14 to 18 bits. Neither controller",
+        "nor sensor is stated. Named: the effect alone. Visible: an oracle that knows motion, force and",
+        f"noise gains at least {_VISIBLE:g} nats. Intervals: the share of 95 % intervals that hold the truth",
+        "where the model has all effects, with the 99 % range of so many draws.",
+        "",
+        "| hidden | runs | visible | of those named | others named as well or instead | intervals | range |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for kind in (NONE, *HIDDEN):
+        of = [r for r in records if r["hidden"] == kind]
+        if not of:
+            continue
+        right = [] if kind == NONE else [kind]
+        seen = [r for r in of if kind == NONE or r["oracle"] >= _VISIBLE]
+        named = sum(r["named"] == right for r in seen)
+        wrong = sorted({" + ".join(r["named"]) for r in of if r["named"] not in (right, [])})
+        z = np.array([v for r in of if r["named"] == right for v in r["z"].values()])
+        hold = f"{100 * np.mean(np.abs(z) < 1.96):.1f} % of {z.size}" if z.size else "-"
+        low, high = (100 * x / max(z.size, 1) for x in binom.interval(0.99, max(z.size, 1), 0.95))
+        cells = [kind, len(of), "-" if kind == NONE else len(seen), named, ", ".join(wrong), hold]
+        lines.append(f"| {' | '.join(str(c) for c in cells)} | {low:.0f}-{high:.0f} % |")
+    complete = [r["complete"] for r in records if r["hidden"] == NONE]
+    lines += ["", f"Of {len(complete)} complete models {complete.count(True)} are called complete, "]
+    lines[-1] += f"{complete.count(False)} incomplete. A search takes "
+    lines[-1] += f"{np.median([r['seconds'] for r in records]):.0f} s (median)."
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """Run what is missing, and write the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=int, default=30, help="joints")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first joint")
+    parser.add_argument("--kind", choices=(NONE, *HIDDEN), action="append", help="default: all")
+    parser.add_argument("-o", metavar="DIR", type=Path, default=HERE)
+    options = parser.parse_args()
+    options.o.mkdir(parents=True, exist_ok=True)
+    stored = options.o / "slow_logs.jsonl"
+    records, commit = read_runs(stored), commit_of(HERE.parents[1])
+    done = {(r["seed"], r["hidden"]) for r in records}
+    for seed in range(options.first, options.first + options.runs):
+        for kind in options.kind or (NONE, *HIDDEN):
+            if (seed, kind) in done:
+                continue
+            records.append(run(seed, kind, commit))
+            append_runs(stored, records[-1:])
+            last = records[-1]
+            print(seed, kind, last["verdict"], last["named"], f"{last['seconds']:.0f} s", file=sys.stderr)
+    text = table(records)
+    (options.o / "slow_logs.md").write_text(text)
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
