@@ -285,6 +285,8 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
         if also.clipped is not None:
             run = without_clipped(run, also.clipped, machine)
         run = _with_force_noise(run, also.force_noise)
+        if found.held is not None and run.log.period == fit.log.period:
+            run = replace(run, data=replace(run.data, hold=found.held))
         other = None if also.reference_hold == machine.reference_hold else also.reference_hold
         more[k] = replace(run, reference_hold=run.reference_hold or other)
     return replace(

@@ -33,6 +33,17 @@ def test_a_log_of_some_ticks_shows_that_its_loop_is_faster(every):
     assert any("the loop is faster than the log" in f.what for f in session.findings)
 
 
+def test_further_logs_of_the_same_rate_follow():
+    run = SETUP.run()
+    text = case_text(SETUP, tuple(EFFECTS.items()), motion="rotary", sensor=False, closed=False)
+    log = {name: run[key][::2] for name, key in (("t", "t"), ("q", "position"), ("u", "force"))}
+    half = len(log["t"]) // 2
+    logs = [{name: x[part] for name, x in log.items()} for part in (slice(0, half), slice(half, None))]
+    session = open_session(tomllib.loads(text), logs)
+    holds = [part.data.hold for part in (session.fit, *session.more)]
+    assert holds == [pytest.approx(1 / RATE, rel=0.5)] * 2
+
+
 def test_a_log_of_every_tick_has_none():
     session = opened(1)
     assert session.fit.data.hold == pytest.approx(1 / RATE)
