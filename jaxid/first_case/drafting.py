@@ -283,7 +283,7 @@ class Draft:
         inertia = {"guess": rounded(rough.inertia)}
         if rough.weight is not None:
             x, y = (rounded(w / _GRAVITY, 3) for w in rough.weight)
-            plant = _pendulum([{"guess": x}, {"guess": y}, 0.0], inertia, [_GRAVITY, 0.0, 0.0])
+            plant = _pendulum([{"guess": x}, {"guess": y}, 0.0], inertia, [_GRAVITY, 0.0, 0.0], units)
             plant[0].assumed.append(
                 "the force has a part as of a weight that turns with the joint: first_moment"
             )
@@ -334,7 +334,8 @@ class Draft:
         """Return a pendulum that swings freely: its weight is known, or every value has that factor."""
         weight = _MOMENT * _GRAVITY
         down = [rounded(_GRAVITY * np.cos(swing.rest), 6), rounded(_GRAVITY * np.sin(swing.rest), 6), 0.0]
-        plant = _pendulum([_MOMENT, 0.0, 0.0], {"guess": rounded(swing.inertia * weight)}, down)
+        inertia = {"guess": rounded(swing.inertia * weight)}
+        plant = _pendulum([_MOMENT, 0.0, 0.0], inertia, down, self._units())
         plant[0].assumed.append("no force is logged, and the joint swings freely: its weight moves it")
         plant[0].assumed.append(f"it hangs at rest at {swing.rest:.4g} rad")
         plant[1].assumed.append(f"mass times distance of the centre is {_MOMENT:g} kg m")
@@ -484,7 +485,9 @@ def _positive(rough: RoughBalance, name: str) -> float:
     return rounded(max(getattr(rough, name), least))
 
 
-def _pendulum(first_moment: list[Any], inertia: dict[str, float], gravity: list[float]) -> list[Section]:
+def _pendulum(
+    first_moment: list[Any], inertia: dict[str, float], gravity: list[float], units: Units
+) -> list[Section]:
     """Return the tables of one link that turns about a horizontal axis."""
     plant = Section("[plant]", {"kind": "serial_arm", "gravity_vector": gravity})
     plant.notes["gravity_vector"] = "in the plane of the swing"
@@ -498,7 +501,10 @@ def _pendulum(first_moment: list[Any], inertia: dict[str, float], gravity: list[
             "first_moment": first_moment,
             "inertia": [0.0, 0.0, 0.0, 0.0, 0.0, inertia],
         },
-        {"first_moment": "mass times centre [kg m]", "inertia": "about the joint [kg m^2]"},
+        {
+            "first_moment": f"mass times centre [{units.label('moment')}]",
+            "inertia": f"about the joint [{units.label('inertia', 'rotary')}]",
+        },
     )
     return [plant, link]
 

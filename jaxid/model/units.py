@@ -46,6 +46,9 @@ class Units:
             labels["position"] = self.position or labels["position"]
             labels["force"] = self.force or labels["force"]
             labels["inertia"] = f"{labels['force']} s^2/{labels['position']}"
+        if self.force is not None:
+            # Times the acceleration of gravity it is a force.
+            labels["moment"] = f"{self.force} s^2/m"
         if dimension in labels:
             return labels[dimension]
         over, _, under = dimension.partition("/")

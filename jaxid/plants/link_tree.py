@@ -18,7 +18,7 @@ from jaxid.plants.few_joints import MOST_JOINTS, FewJoints
 from jaxid.plants.geometry import Geometry
 from jaxid.plants.rigid_tree import Tree, inverse_dynamics, pseudo_inertia
 
-_FIRST = ("inertia*position", "free")
+_FIRST = ("moment", "free")
 _SECOND = ("inertia", "free")
 
 

@@ -14,7 +14,7 @@ LABELS = {
     "position": ("m", "rad", "V"),
     "time": ("s", "s", "s"),
     "inertia": ("kg", "kg m^2", "V s^2/V"),
-    "moment": ("kg m", "kg m", "kg m"),
+    "moment": ("kg m", "kg m", "V s^2/m"),
     "1": ("1", "1", "1"),
     "1/time": ("1/s", "1/s", "1/s"),
     "position/time": ("m/s", "rad/s", "V/s"),
@@ -37,6 +37,8 @@ def test_labels(dimension):
 def test_one_override_leaves_the_other():
     assert Units("rotary", force="A").label("force*time/position") == "A s/rad"
     assert Units("rotary", force="A").label("inertia") == "A s^2/rad"
+    assert Units("rotary", force="A").label("moment") == "A s^2/m"
+    assert Units("rotary").label("moment") == "kg m"
 
 
 def test_unknown_dimension_is_refused():
