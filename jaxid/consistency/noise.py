@@ -25,6 +25,9 @@ _SAMPLES_EACH = 40
 # Readings of other rows say nothing of a force if that of the same row leaves less of it than this times what
 # all of them leave. All of them say something if they leave less of it by more than the second factor.
 _NO_MORE, _SOME = 1.1, 1.2
+# Rows before, and the least part of what all explain that they explain in the log of a loop of the same rate,
+# which differentiates over them.
+_PAST, _OTHER_ROWS = 2, 0.06
 # Part of the band of inverse dynamics in which its residual bounds the noise of the force.
 _BAND = (0.3, 0.8)
 # Fewest frequencies that give a median.
@@ -133,20 +136,40 @@ def _beyond_controller(
         of = [log.readings[:, int(j)]]
         if log.reference is not None:
             of.append(log.reference[:, min(k, log.reference.shape[1] - 1)])
-        noise[k], same_row, total, answer = _unexplained(log.force[:, k], of)
-        shown = same_row < _NO_MORE * noise[k] and total > _SOME * noise[k]
+        found = _unexplained(log.force[:, k], of)
+        noise[k], total, answer = found.left, found.total, found.factor
+        shown = found.same_row < _NO_MORE * noise[k] and total > _SOME * noise[k]
+        shown = shown and found.other_rows < _OTHER_ROWS
         faster[k] = fast or shown
         answers[k] = answer if shown else 0.0
         noise[k] = total if faster[k] else noise[k]
     return noise, faster, answers
 
 
-def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> tuple[float, float, float, float]:
-    """Return what other signals leave of the high band of a signal, as the deviation of a white noise.
+class _Unexplained(NamedTuple):
+    """Noise in the high band of a signal, as the deviation of a white noise, and what explains it.
 
-    Returns:
-        What no linear filter of all the others explains; what the first of them does not explain at the same
-        row; the whole band; and the factor from the first one to the signal.
+    Args:
+        left: What no linear filter of the other signals explains.
+        same_row: What the first of them does not explain at the same row.
+        total: The whole band.
+        factor: Factor from the first of the others to the signal, at the same row.
+        other_rows: Part of what its last three rows explain (in squares) that the same row does not.
+    """
+
+    left: float
+    same_row: float
+    total: float
+    factor: float
+    other_rows: float
+
+
+def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> _Unexplained:
+    """Return what other signals leave of the high band of a signal.
+
+    Args:
+        u: The signal.
+        of: The others.
     """
     room = max(u.size // (_SAMPLES_EACH * len(of)), 1)
     share = min(1.0, room / (_BEFORE + _AFTER + 1))
@@ -159,20 +182,28 @@ def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> tuple[float, float, flo
 
     target = spectra(u, range(1))
     around = np.concatenate([spectra(x, range(-after, before + 1)) for x in of], axis=1)
-    left, _ = _left_by(target, around)
+    left = _deviation(_left_by(target, around)[0])
     same_row, factor = _left_by(target, spectra(of[0], range(1)))
-    return left, same_row, _deviation(target), float(factor[0])
+    three, _ = _left_by(target, spectra(of[0], range(min(before, _PAST) + 1)))
+    squares = [float(np.linalg.norm(x) ** 2) for x in (target, same_row, three)]
+    return _Unexplained(
+        left=left,
+        same_row=_deviation(same_row),
+        total=_deviation(target),
+        factor=float(factor[0]),
+        other_rows=(squares[1] - squares[2]) / max(squares[0] - squares[2], 1e-300),
+    )
 
 
-def _left_by(target: np.ndarray, columns: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the noise in a spectrum that no real combination of others explains, and the combination."""
+def _left_by(target: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is left of a spectrum by the best real combination of others, and the combination."""
     power = np.linalg.norm(columns, axis=0)
     scaled = columns / np.where(power > 0, power, 1.0)
 
     # Real coefficients for complex spectra: both parts are rows.
     rows, right = (np.concatenate([np.real(x), np.imag(x)]) for x in (scaled, target))
     solved = np.linalg.lstsq(rows, right, rcond=1e-10)[0]
-    return _deviation(target - scaled @ solved), solved[:, 0] / np.where(power > 0, power, 1.0)
+    return target - scaled @ solved, solved[:, 0] / np.where(power > 0, power, 1.0)
 
 
 def _deviation(spectrum: np.ndarray) -> float:
