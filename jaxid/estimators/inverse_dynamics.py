@@ -114,7 +114,7 @@ def inverse_dynamics_steps(
     e = np.asarray(fit.residual).reshape(rows.shape)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = force_precision(machine, size, np.asarray(fit.theta), e, jacobian, rows)
-    if np.all(np.isfinite(jacobian)):
+    if data.faster_loop and np.all(np.isfinite(jacobian)):
         precision = precision.widened(widening(precision, jacobian, e, rows))
     converged = bool(fit.converged) and bool(np.all(np.isfinite(fit.theta)))
     return Estimate(

@@ -102,6 +102,11 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
     if tick is not None:
         findings.append(tick.finding(log))
         settings["tick"] = tick.setting()
+        # Of the two courses that a simulation has, lines are nearer to a force that acts for half a row.
+        if log.hold != "linear":
+            hold = "linear"
+            opened = under_hold(hold, opened, machine)
+            log, data = opened.log, opened.data
         data = replace(data, hold=tick.period)
         declared = balance_fits(machine, data)[0]
 

@@ -48,6 +48,13 @@ def case(*, cogging: bool = False) -> dict:
     }
 
 
+@pytest.fixture
+def shows_no_tick(monkeypatch):
+    """Make the log one that does not show that its loop is faster."""
+    monkeypatch.setattr("jaxid.session.against_case.faster_tick", lambda *_, **__: None)
+
+
+@pytest.mark.usefixtures("shows_no_tick")
 def test_what_was_missing_had_hidden_the_hold(log):
     session = open_session(case(), log, align_hold=True, method="discover")
     assert session.fit.log.hold == "zero_order"
@@ -61,6 +68,7 @@ def test_what_was_missing_had_hidden_the_hold(log):
     assert session_under_better_hold(replace(session, chooses_hold=False), whole) is None
 
 
+@pytest.mark.usefixtures("shows_no_tick")
 def test_an_effect_in_time_gives_way_to_the_other_hold_if_that_leaves_less(log):
     """Without the ripple neither hold is clearly better: what the shift leaves decides."""
     session = open_session(case(), log, align_hold=True, method="discover")

@@ -23,7 +23,7 @@ from jaxid.estimators.several.sums import shares, stacked, summed
 from jaxid.estimators.several.weights import descended_steps, disagreement, start_weights
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import SolveRequest, Steps
-from jaxid.numerics.misspecified import std_under_misspecification
+from jaxid.numerics.misspecified import std_under_misspecification, widening
 from jaxid.numerics.rows import Rows, assess_together
 from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
 
@@ -186,6 +186,9 @@ def _estimate(
     theta, guess = scale.outward(found.x)[0], machine.parameters.guess
     natural = np.where(guess != 0, guess, 1.0)
     precision = assess_together(machine.parameters.names, logs, natural)
+    if any(part.data.faster_loop for part in parts) and found.model.finite:
+        lengths = [len(log.residual) for log in logs]
+        precision = precision.widened(widening(precision, *stacked(logs), lengths))
     converged = found.converged and bool(np.all(np.isfinite(theta)))
     residual = [
         np.where(log.counts, log.residual / np.where(log.counts, factor, 1.0), np.nan)
