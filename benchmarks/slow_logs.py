@@ -15,6 +15,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from scipy.stats import binom
 
@@ -107,6 +108,8 @@ def main() -> int:
     records, commit = read_runs(stored), commit_of(HERE.parents[1])
     done = {(r["seed"], r["hidden"]) for r in records}
     for seed in range(options.first, options.first + options.runs):
+        # A process has room for the compiled code of some dozen searches.
+        jax.clear_caches()
         for kind in options.kind or (NONE, *HIDDEN):
             if (seed, kind) in done:
                 continue
