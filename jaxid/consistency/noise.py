@@ -22,11 +22,12 @@ from jaxid.simulation.sensor_noise import position_density
 _BEFORE, _AFTER = 8, 4
 # Samples of a log for each of these coefficients.
 _SAMPLES_EACH = 40
-# Readings of other rows say nothing of a force if that of the same row leaves less of it than this times what
-# all of them leave. All of them say something if they leave less of it by more than the second factor.
+# A loop is faster than its log if the reading of the same row explains the high band of its force nearly as
+# well as all readings around it do: it leaves less than the first factor times their remainder, and the whole
+# band is more than the second factor times that.
 _NO_MORE, _SOME = 1.1, 1.2
-# Rows before, and the least part of what all explain that they explain in the log of a loop of the same rate,
-# which differentiates over them.
+# Rows before the same one, and the part (in squares) that they add at least to its explanation in the log of
+# a loop of the same rate, which differentiates over them.
 _PAST, _OTHER_ROWS = 2, 0.06
 # Part of the band of inverse dynamics in which its residual bounds the noise of the force.
 _BAND = (0.3, 0.8)
@@ -119,7 +120,7 @@ def loop_is_faster(machine: Machine, log: Log) -> bool:
 def _beyond_controller(
     machine: Machine, log: Log, *, fast: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the noise of each force beyond what a controller of the log's rate makes of its readings.
+    """Return the noise of each force that no controller of the log's rate makes of its readings.
 
     A controller of the log's rate differentiates the noise of its readings over rows, and the force that it
     makes of it acts. In a log of a faster loop only the noise of the same row is in the force. It acts for a
@@ -147,14 +148,14 @@ def _beyond_controller(
 
 
 class _Unexplained(NamedTuple):
-    """Noise in the high band of a signal, as the deviation of a white noise, and what explains it.
+    """Noise in the high band of a signal, as the deviation of a white noise, by the signals that explain it.
 
     Args:
-        left: What no linear filter of the other signals explains.
-        same_row: What the first of them does not explain at the same row.
+        left: The part that no linear filter of the other signals explains.
+        same_row: The part that the first of them does not explain at the same row.
         total: The whole band.
         factor: Factor from the first of the others to the signal, at the same row.
-        other_rows: Part of what its last three rows explain (in squares) that the same row does not.
+        other_rows: Part that the same row does not explain of the squares that its last three rows explain.
     """
 
     left: float
@@ -165,7 +166,7 @@ class _Unexplained(NamedTuple):
 
 
 def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> _Unexplained:
-    """Return what other signals leave of the high band of a signal.
+    """Compare the high band of a signal with that of other signals.
 
     Args:
         u: The signal.
@@ -196,7 +197,7 @@ def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> _Unexplained:
 
 
 def _left_by(target: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what is left of a spectrum by the best real combination of others, and the combination."""
+    """Return the remainder of a spectrum after the best real combination of others, and the combination."""
     power = np.linalg.norm(columns, axis=0)
     scaled = columns / np.where(power > 0, power, 1.0)
 
