@@ -36,7 +36,7 @@ _DRAWN = 1e-3
 
 # A mass of the machine, or another positive parameter of its plant, is next to nothing below this part of its
 # value without an effect.
-_NOTHING = 0.05
+_NOTHING = 0.1
 
 
 @dataclass

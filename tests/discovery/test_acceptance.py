@@ -217,7 +217,7 @@ def test_a_limit_that_leaves_no_inertia_is_turned_down(axis):
         search.acceptance.objection(index, off, with_values(search, "saturation", 1e3), None, None, 4) == ""
     )
     light = with_values(search, "saturation", 1e3)
-    light[names.index("inertia")] *= 0.02
+    light[names.index("inertia")] *= 0.06
     why = search.acceptance.objection(index, off, light, None, None, 4)
     assert why.startswith("inertia would be next to nothing beside it")
 
