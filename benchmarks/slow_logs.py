@@ -22,12 +22,16 @@ from scipy.stats import binom
 import jaxid
 from benchmarks.stored_runs import append_runs, commit_of, read_runs
 from truth.axis.cases import case_text
-from truth.axis.slow_logs import HIDDEN, robot_joint, visible, with_hidden
+from truth.axis.machines import Setup
+from truth.axis.slow_logs import HIDDEN, robot_joint, with_hidden
+from truth.hidden.oracle import effect_force, evidence_beyond
 
 HERE = Path(__file__).parent / "results"
 NONE = "none"
 # Gain of the oracle from which an effect counts as visible [nats].
 _VISIBLE = 30.0
+# Velocity from which a sample counts there [rad/s].
+_SLOWEST = 0.01
 
 
 def run(seed: int, kind: str, commit: str) -> dict[str, Any]:
@@ -56,6 +60,29 @@ def run(seed: int, kind: str, commit: str) -> dict[str, Any]:
         "seconds": time.perf_counter() - begin,
         "commit": commit,
     }
+
+
+def visible(setup: Setup, log: dict[str, np.ndarray], kind: str) -> float:
+    """Return what an oracle gains in log-likelihood by a hidden effect [nats].
+
+    It knows the true motion, the effect's force and the noise of a row: what the loop makes of its encoder's
+    noise, and that of the current's sensor. The part of the force that inertia and declared frictions can
+    take on is taken off.
+
+    Args:
+        setup: The joint with the effect.
+        log: Its log, with the truth behind it.
+        kind: Kind of the effect.
+    """
+    v, a = log["true_velocity"], log["true_acceleration"]
+    sensor, loop = setup.sensor, setup.loop
+    reading = np.hypot(sensor.position_noise, sensor.position_resolution / np.sqrt(12))
+    slope = loop.kv * setup.rate / loop.velocity_average
+    of_loop = np.hypot(slope + loop.kv * loop.kp, slope) * reading
+    noise = setup.machine.actuator_gain * np.hypot(of_loop, sensor.force_noise)
+    in_motion = np.abs(v) > _SLOWEST
+    columns = np.stack([a, v, np.sign(v)], axis=1)[in_motion]
+    return evidence_beyond(columns, effect_force(kind, setup, log)[in_motion] / noise)
 
 
 def table(records: list[dict[str, Any]]) -> str:

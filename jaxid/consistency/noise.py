@@ -90,11 +90,11 @@ def estimated_force_noise(
             is none that reproduces the logged one.
         fast: Whether the loop is known to be faster than the log.
     """
-    beyond, faster_loop, answer = _beyond_controller(machine, log, fast=fast)
-    in_band = noise_in_band(machine, log, data, fit.fit(bounded=False)[1], fit.counts)
+    high, in_band = _beyond_controller(machine, log, fast=fast), _in_band(machine, log, data, fit)
     # The high band has more frequencies than the band of a balance, and so the better estimate of one noise.
-    in_band = np.where(faster_loop & (beyond < _ALIKE * in_band), np.maximum(in_band, beyond), in_band)
-    bounds = [beyond, in_band, signals.noise_within_stretches(log.force)]
+    alike = high.faster & (high.noise < _ALIKE * in_band)
+    in_band = np.where(alike, np.maximum(in_band, high.noise), in_band)
+    bounds = [high.noise, in_band, signals.noise_within_stretches(log.force)]
     if law is not None:
         bounds.append(signals.high_band_std(log.force - law))
     if data.recipe.median:
@@ -102,8 +102,11 @@ def estimated_force_noise(
         bounds = [b if k == 1 else b / white for k, b in enumerate(bounds)]
     noise = np.min(bounds, axis=0)
     steps = np.array([_step(u) for u in log.force.T])
-    found = ForceNoise(np.maximum(noise, steps / np.sqrt(12)), bool(faster_loop.any()))
-    return found._replace(answer=answer) if answer.any() else found
+    return ForceNoise(
+        std=np.maximum(noise, steps / np.sqrt(12)),
+        faster_loop=bool(high.faster.any()),
+        answer=high.answer if high.answer.any() else None,
+    )
 
 
 def _step(u: np.ndarray) -> float:
@@ -114,37 +117,43 @@ def _step(u: np.ndarray) -> float:
 
 def loop_is_faster(machine: Machine, log: Log) -> bool:
     """Check whether a controller that is faster than the log made a force, by its answer to noise."""
-    return bool(np.any(_beyond_controller(machine, log)[1]))
+    return bool(np.any(_beyond_controller(machine, log).faster))
 
 
-def _beyond_controller(
-    machine: Machine, log: Log, *, fast: bool = False
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+class _HighBand(NamedTuple):
+    """High band of each force, (m,) each.
+
+    Args:
+        noise: Its standard deviation that counts as noise.
+        faster: Whether the loop is faster than the log.
+        answer: Answer of the force to the noise of its row, where the band shows it; else zero.
+    """
+
+    noise: np.ndarray
+    faster: np.ndarray
+    answer: np.ndarray
+
+
+def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False) -> _HighBand:
     """Return the noise of each force that no controller of the log's rate makes of its readings.
 
     A controller of the log's rate differentiates the noise of its readings over rows, and the force that it
     makes of it acts. In a log of a faster loop only the noise of the same row is in the force. It acts for a
-    tick, and the rows do not show the others: the whole high band is then noise of the force.
-
-    Returns:
-        The standard deviation in the high band, whether the loop is faster than the log, and the answer of
-        the force to the noise of its row where that shows it, (m,) each.
+    tick, and the rows do not show the others: the whole high band is then noise of the force. A declared
+    controller has its own rate.
     """
-    driven = machine.plant.driven(machine.plant.joints)
-    noise, faster = np.empty(log.force.shape[1]), np.zeros(log.force.shape[1], dtype=bool)
-    answers = np.zeros(log.force.shape[1])
+    driven, drives = machine.plant.driven(machine.plant.joints), log.force.shape[1]
+    out = _HighBand(np.empty(drives), np.zeros(drives, dtype=bool), np.zeros(drives))
     for k, j in enumerate(driven):
         of = [log.readings[:, int(j)]]
         if log.reference is not None:
             of.append(log.reference[:, min(k, log.reference.shape[1] - 1)])
         found = _unexplained(log.force[:, k], of)
-        noise[k], total, answer = found.left, found.total, found.factor
-        shown = found.same_row < _NO_MORE * noise[k] and total > _SOME * noise[k]
-        shown = shown and found.other_rows < _OTHER_ROWS
-        faster[k] = fast or shown
-        answers[k] = answer if shown else 0.0
-        noise[k] = total if faster[k] else noise[k]
-    return noise, faster, answers
+        shown = machine.controller is None and found.of_same_row
+        out.faster[k] = fast or shown
+        out.answer[k] = found.factor if shown else 0.0
+        out.noise[k] = found.total if out.faster[k] else found.left
+    return out
 
 
 class _Unexplained(NamedTuple):
@@ -163,6 +172,12 @@ class _Unexplained(NamedTuple):
     total: float
     factor: float
     other_rows: float
+
+    @property
+    def of_same_row(self) -> bool:
+        """True if the first of the others explains much of the signal, and by its same row alone."""
+        much = self.total > _SOME * self.left and self.same_row < _NO_MORE * self.left
+        return much and self.other_rows < _OTHER_ROWS
 
 
 def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> _Unexplained:
@@ -222,32 +237,19 @@ def _high_band(x: Float[np.ndarray, "time k"]) -> np.ndarray:
     return spectrum[(f > 0.3) & (f < 0.475)] / np.linalg.norm(window)
 
 
-def noise_in_band(
-    machine: Machine,
-    log: Log,
-    data: Prepared,
-    residual: Float[np.ndarray, "kept n"],
-    counts: Bool[np.ndarray, "kept n"],
-) -> Float[np.ndarray, " m"]:
-    """Return the white noise of each force that the residual of inverse dynamics allows; inf if unknown.
-
-    Args:
-        machine: The machine.
-        log: The log.
-        data: The prepared log.
-        residual: Force residual of the best balance.
-        counts: Mask of the samples that count.
-    """
+def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.ndarray:
+    """Return the white noise of each force that the residual of inverse dynamics allows; inf if unknown."""
     out = np.full(log.force.shape[1], np.inf)
     if not all(log.measured):
         return out
+    residual = fit.fit(bounded=False)[1]
     rate = log.rate_hz / data.recipe.decimation
     top = data.recipe.edge * log.rate_hz / 2 if data.recipe.edge else data.recipe.band_hz(log.rate_hz)
     top = min(top, 0.5 * rate)
     f_all, of_position = position_density(machine, log, data)
     for k, joint in enumerate(machine.plant.driven(machine.plant.joints)):
         j = int(joint)
-        f, power = _periodogram(residual[:, j], counts[:, j], rate)
+        f, power = _periodogram(residual[:, j], fit.counts[:, j], rate)
         band = (f > _BAND[0] * top) & (f < _BAND[1] * top)
         if band.sum() < _FREQUENCIES or machine.gain[k] == 0:
             continue
@@ -291,10 +293,7 @@ def _force(
     if machine.sensor.force_noise is None:
         return []
     stated = np.broadcast_to(np.asarray(machine.sensor.force_noise), estimate.shape)
-    high, low = (
-        _beyond_controller(machine, log)[0],
-        noise_in_band(machine, log, data, fit.fit(bounded=False)[1], fit.counts),
-    )
+    high, low = _beyond_controller(machine, log).noise, _in_band(machine, log, data, fit)
     white = (high < _ALIKE * low) & (low < _ALIKE * high)
     findings = []
     for k, (of, found) in enumerate(zip(stated, estimate, strict=True)):

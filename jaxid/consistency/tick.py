@@ -35,7 +35,7 @@ class Tick(NamedTuple):
     def finding(self, log: Log) -> Finding:
         """Return the note on it."""
         acts = f"each force seems to act for {1e3 * self.period:.2g} ms"
-        what = f"the loop is faster than the log: {acts}, and those between the rows are not in the log"
+        what = f"the loop is faster than the log: {acts}, and the log lacks the forces between its rows"
         return Finding("warning", what, f"{log.source}, force", "log every tick of the loop if you can")
 
     def setting(self) -> dict[str, str]:

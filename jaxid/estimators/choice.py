@@ -91,7 +91,8 @@ def choose_method(session: Session, asked: str | None = None, *, curvature: bool
     if all(log.measured) and any(run.data.faster_loop for run in session.fits) and not asks_likelihood:
         return Choice(
             "inverse_dynamics",
-            "the loop is faster than the log: a force between two rows is not known, its mean over many is",
+            "the loop is faster than the log, which lacks the forces between its rows: only their mean over "
+            "many rows is known",
         )
 
     how = "open loop and feedback are one case" if controller is None else "the log holds the command"

@@ -27,7 +27,11 @@ def _table(registry: Mapping[str, type], noun: str) -> str:
     linear, rotary = Units("linear"), Units("rotary")
     rows = [[noun, "parameter", "sign", "linear", "rotary", "description"]]
     for kind, cls in registry.items():
-        asked = " `discover` searches for it on request." if getattr(cls, "on_request", False) else ""
+        asked = ""
+        if getattr(cls, "on_request", False):
+            asked = " `discover` searches for it on request."
+        elif getattr(cls, "in_links", False):
+            asked = " At an arm `discover` searches for it on request."
         rows.append([kind, "", "", "", "", (cls.__doc__ or "").strip().splitlines()[0] + asked])
         for name, info in parameters_of(cls).items():
             shown = f"{name}?" if info.optional else name

@@ -369,7 +369,11 @@ def open_another(session: Session, log: LogLike) -> OpenedLog:
         answer=known.answer,
     )
     opened = replace(opened, data=data)
-    return opened if opened.log.hold == machine.hold else under_hold(machine.hold, opened, machine)
+    if opened.log.hold != machine.hold:
+        opened = under_hold(machine.hold, opened, machine)
+    if "tick" in session.settings:
+        opened = replace(opened, data=replace(opened.data, hold=known.hold))
+    return opened
 
 
 def session_around(case: Case, machine: Machine, log: Log, recipe: Recipe | None = None) -> Session:

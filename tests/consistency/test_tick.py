@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid
-from jaxid.session import Session, open_session
+from jaxid.session import Session, open_another, open_session
 from truth.axis.cases import case_text
 from truth.axis.machines import Setup
 from truth.axis.slow_logs import HIDDEN, RATE, robot_joint, with_hidden
@@ -61,10 +61,28 @@ def test_a_log_of_every_tick_has_none(of):
     assert "tick" not in session.settings
 
 
+def test_a_declared_loop_has_its_own_period():
+    run = SETUP.run()
+    text = case_text(SETUP, tuple(EFFECTS.items()), motion="rotary", sensor=False, closed=True)
+    names = (("t", "t"), ("q", "position"), ("u", "force"), ("ref", "reference"))
+    log = {name: run[key][::5] for name, key in names}
+    session = open_session(tomllib.loads(text.replace("[controller]", "[controller]\nperiod = 0.001")), log)
+    assert not session.fit.data.faster_loop
+    assert "tick" not in session.settings
+
+
 def test_a_stated_hold_is_kept():
     session = opened(2, more='hold = "zero_order"\n')
     assert session.fit.data.hold == pytest.approx(2 / RATE)
     assert "tick" not in session.settings
+
+
+def test_a_log_that_is_opened_later_follows_too():
+    session, run = opened(2), SETUP.run()
+    log = {name: run[key][::2] for name, key in (("t", "t"), ("q", "position"), ("u", "force"))}
+    later = open_another(session, log)
+    assert later.data.hold == session.fit.data.hold
+    assert later.data.faster_loop
 
 
 @pytest.mark.parametrize("kind", HIDDEN)
@@ -72,12 +90,14 @@ def test_what_is_missing_is_no_tick(kind):
     assert "tick" not in opened(1, with_hidden(SETUP, kind)).settings
 
 
-def test_values_of_every_second_tick_hold_and_nothing_is_missing():
+@pytest.mark.parametrize("every", [2, 5])
+def test_values_of_a_faster_loop_hold_and_nothing_is_missing(every):
     run = SETUP.run()
     text = case_text(SETUP, tuple(EFFECTS.items()), motion="rotary", sensor=False, closed=False)
     log = {"t": run["t"], "q": run["position"], "u": run["force"]}
     case = tomllib.loads(text)
-    found = jaxid.identify(case, {name: x[::2] for name, x in log.items()})
+    found = jaxid.identify(case, {name: x[::every] for name, x in log.items()})
+    assert found.model_complete is True
     assert found.estimate.method == "inverse_dynamics"
     assert any("faster than the log" in note for note in found.estimate.notes)
     fit = found.estimate

@@ -52,33 +52,3 @@ HIDDEN = {
 def with_hidden(setup: Setup, kind: str) -> Setup:
     """Return the joint with an effect that its case does not declare."""
     return replace(setup, machine=setup.machine.with_effect(kind, **HIDDEN[kind]))
-
-
-def visible(setup: Setup, run: dict[str, np.ndarray], kind: str) -> float:
-    """Return what an oracle gains in log-likelihood by a hidden effect [nats].
-
-    It knows the true motion, the effect's force and the noise of a row, which is what the loop makes of its
-    encoder's noise. What inertia and declared frictions can take on of that force is taken off.
-
-    Args:
-        setup: The joint with the effect.
-        run: Its log, with the truth behind it.
-        kind: Kind of the effect.
-    """
-    q, v, a = run["true_position"], run["true_velocity"], run["true_acceleration"]
-    p = HIDDEN[kind]
-    force = {
-        "stribeck_friction": lambda: p["level"] * np.exp(-((v / p["velocity"]) ** 2)) * np.sign(v),
-        "unbalance": lambda: 9.81 * p["moment"] * np.cos(q + p["phase"]),
-        "cogging": lambda: p["amplitude"] * np.cos(2 * np.pi * q / p["period"] + p["phase"]),
-        "quadratic_drag": lambda: p["coefficient"] * v * np.abs(v),
-        "linear_stiffness": lambda: p["coefficient"] * q,
-    }[kind]()
-    moves_now = np.abs(v) > 0.01
-    columns = np.stack([a, v, np.sign(v)], axis=1)[moves_now]
-    left = force[moves_now] - columns @ np.linalg.lstsq(columns, force[moves_now], rcond=None)[0]
-    sensor = setup.sensor
-    reading = np.hypot(sensor.position_noise, sensor.position_resolution / np.sqrt(12))
-    slope = setup.loop.kv * setup.rate / 2
-    noise = np.hypot(np.hypot(slope + setup.loop.kv * setup.loop.kp, slope) * reading, sensor.force_noise)
-    return float(0.5 * np.sum((left / (setup.machine.actuator_gain * noise)) ** 2))

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from truth.axis.machines import Setup
+from truth.axis.stepper import STANDARD_GRAVITY
 from truth.hidden.cases import HiddenCase
 
 Log = Mapping[str, np.ndarray]
@@ -274,6 +275,8 @@ def effect_force(kind: str, setup: Setup, log: Log) -> np.ndarray:
     side = np.sign(v)
     if kind == "cogging":
         return -values["amplitude"] * np.cos(2 * np.pi * q / values["period"] + values["phase"])
+    if kind == "unbalance":
+        return -values["moment"] * STANDARD_GRAVITY * np.cos(q + values["phase"])
     if kind == "stribeck_friction":
         return -values["level"] * side * np.exp(-((v / values["velocity"]) ** 2))
     if kind == "friction_drift":

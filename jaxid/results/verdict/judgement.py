@@ -354,10 +354,12 @@ def _loop_words(session: Session) -> list[str]:
         return []
     law = law_of_rows(machine, log)
     named = f" (its rows are those of {law})" if law else ""
+    rate = f"{plain(log.rate_hz)} Hz of the log"
+    known = session.fit.data.faster_loop
+    faster = f"as the loop is faster than the {rate}" if known else f"if the loop is faster than the {rate}"
     return [
-        f"The log has a reference, and the case no [controller]{named}: if the loop is faster than the "
-        f"{plain(log.rate_hz)} Hz of the log, its force changes between the rows, and only a declared loop "
-        "with its period gives it."
+        f"The log has a reference, and the case no [controller]{named}: {faster}, its force changes between "
+        "the rows, and only a declared loop with its period gives it."
     ]
 
 
