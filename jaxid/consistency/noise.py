@@ -23,12 +23,15 @@ _BEFORE, _AFTER = 8, 4
 # Samples of a log for each of these coefficients.
 _SAMPLES_EACH = 40
 # A loop is faster than its log if the reading of the same row explains the high band of its force nearly as
-# well as all readings around it do: it leaves less than the first factor times their remainder, and the whole
-# band is more than the second factor times that.
-_NO_MORE, _SOME = 1.1, 1.2
-# Rows before the same one, and the part (in squares) that they add at least to its explanation in the log of
-# a loop of the same rate, which differentiates over them.
-_PAST, _OTHER_ROWS = 2, 0.06
+# well as all readings around it do: it leaves less than this factor times their remainder.
+_NO_MORE = 1.1
+# Rows before the same one that may explain more: the loop of a log's rate differentiates over them.
+_PAST = 2
+# The whole band is more than the first factor times the remainder, and the rows before explain less than the
+# second part of what is explained (in squares). The filter of a loop of the log's rate may hide half of its
+# answer to these rows; a force that plainly does not act for a row is not of such a loop.
+_SOME, _OTHER_ROWS = 1.2, 0.06
+_SOME_AT_LEAST, _OTHER_ROWS_AT_MOST = 1.05, 0.2
 # Part of the band of inverse dynamics in which its residual bounds the noise of the force.
 _BAND = (0.3, 0.8)
 # Fewest frequencies that give a median.
@@ -115,9 +118,15 @@ def _step(u: np.ndarray) -> float:
     return step if _LEVELS[0] <= levels <= _LEVELS[1] else 0.0
 
 
-def loop_is_faster(machine: Machine, log: Log) -> bool:
-    """Check whether a controller that is faster than the log made a force, by its answer to noise."""
-    return bool(np.any(_beyond_controller(machine, log).faster))
+def loop_is_faster(machine: Machine, log: Log, *, likely: bool = False) -> bool:
+    """Check whether a controller that is faster than the log made a force, by its answer to noise.
+
+    Args:
+        machine: The machine.
+        log: The log.
+        likely: Whether the force plainly does not act for a row of the log.
+    """
+    return bool(np.any(_beyond_controller(machine, log, likely=likely).faster))
 
 
 class _HighBand(NamedTuple):
@@ -134,26 +143,28 @@ class _HighBand(NamedTuple):
     answer: np.ndarray
 
 
-def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False) -> _HighBand:
+def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False, likely: bool = False) -> _HighBand:
     """Return the noise of each force that no controller of the log's rate makes of its readings.
 
     A controller of the log's rate differentiates the noise of its readings over rows, and the force that it
     makes of it acts. In a log of a faster loop only the noise of the same row is in the force. It acts for a
     tick, and the rows do not show the others: the whole high band is then noise of the force. A declared
-    controller has its own rate.
+    controller has its own rate. All drives of a machine have one loop, whose rate the noise of one may show.
     """
-    driven, drives = machine.plant.driven(machine.plant.joints), log.force.shape[1]
-    out = _HighBand(np.empty(drives), np.zeros(drives, dtype=bool), np.zeros(drives))
+    driven, each = machine.plant.driven(machine.plant.joints), []
     for k, j in enumerate(driven):
         of = [log.readings[:, int(j)]]
         if log.reference is not None:
             of.append(log.reference[:, min(k, log.reference.shape[1] - 1)])
-        found = _unexplained(log.force[:, k], of)
-        shown = machine.controller is None and found.of_same_row
-        out.faster[k] = fast or shown
-        out.answer[k] = found.factor if shown else 0.0
-        out.noise[k] = found.total if out.faster[k] else found.left
-    return out
+        each.append(_unexplained(log.force[:, k], of))
+
+    shown = machine.controller is None and any(found.of_same_row(likely=fast or likely) for found in each)
+    faster = fast or shown
+    return _HighBand(
+        noise=np.array([found.total if faster else found.left for found in each]),
+        faster=np.full(len(each), faster),
+        answer=np.array([found.factor if shown else 0.0 for found in each]),
+    )
 
 
 class _Unexplained(NamedTuple):
@@ -173,11 +184,11 @@ class _Unexplained(NamedTuple):
     factor: float
     other_rows: float
 
-    @property
-    def of_same_row(self) -> bool:
-        """True if the first of the others explains much of the signal, and by its same row alone."""
-        much = self.total > _SOME * self.left and self.same_row < _NO_MORE * self.left
-        return much and self.other_rows < _OTHER_ROWS
+    def of_same_row(self, *, likely: bool) -> bool:
+        """Check that the first of the others explains much of the signal, and by its same row alone."""
+        some, rows = (_SOME_AT_LEAST, _OTHER_ROWS_AT_MOST) if likely else (_SOME, _OTHER_ROWS)
+        much = self.total > some * self.left and self.same_row < _NO_MORE * self.left
+        return much and self.other_rows < rows
 
 
 def _unexplained(u: np.ndarray, of: list[np.ndarray]) -> _Unexplained:

@@ -123,11 +123,15 @@ class Recipe:
         return period if self.align_hold and hold == "zero_order" else 0.0
 
     @property
+    def filled(self) -> float:
+        """Part of the half rate of the kept samples up to the band's edge; decimation leaves 0.8 or less."""
+        most = 2 * A_PERIOD
+        return most if self.edge is None else min(most, self.decimation * self.edge)
+
+    @property
     def independent(self) -> float:
         """Part of the kept samples with independent noise: one half if the band fills the kept rate."""
-        if self.edge is None:
-            return 0.5
-        return min(0.5, 0.5 * self.decimation * self.edge / (2 * A_PERIOD))
+        return 0.5 * self.filled / (2 * A_PERIOD)
 
     @property
     def decimator(self) -> signals.Decimator:

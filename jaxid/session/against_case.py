@@ -98,7 +98,8 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
 
     tick = None
     if free_hold:
-        tick = faster_tick(machine, log, data, declared, fast=loop_is_faster(machine, log))
+        fast = loop_is_faster(machine, log, likely=hold == "linear")
+        tick = faster_tick(machine, log, data, declared, fast=fast)
     if tick is not None:
         findings.append(tick.finding(log))
         settings["tick"] = tick.setting()

@@ -27,8 +27,7 @@ from jaxid.simulation.noisy_loop import noisy_readings
 from jaxid.simulation.replay import make_replay
 from jaxid.simulation.sensor_noise import high_band_force_noise, position_noise
 
-# Part of the half sampling rate of the kept samples that holds the band of the filter, see
-# `jaxid.logs.prepare.A_PERIOD`. Beyond it the filtered residual is rounding and errors of numerics.
+# Part of the half sampling rate of positions that counts.
 _BAND = 0.8
 # A systematic part below this many `NUMERICS` of the force may be an error of filtering and integration.
 _NUMERICS = 2.0
@@ -130,10 +129,12 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
     # A joint of an arm may have a thousandth of another's torque; a joint without a drive has none.
     sizes = np.sqrt(np.mean(gap.measured**2, axis=0))
     numerics = _NUMERICS * NUMERICS * np.where(sizes > 0, sizes, size)
+    # Beyond the filter's band the residual is rounding and errors of numerics.
+    band = run.data.recipe.filled
     least = _EXCESS if fitted else _EXCESS_ELSEWHERE
     out = []
     for joint in joints:
-        tests = [cumulated_excess(z[joint]) for z in whitened]
+        tests = [cumulated_excess(z[joint], band=band) for z in whitened]
         best = int(np.argmin([excess for excess, *_ in tests]))
         excess, count, power = tests[best]
         found = Residual(
@@ -144,7 +145,7 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
             floor=float(floor[joint]),
             excess=excess,
             limit=max(least, float(np.sqrt(-0.5 * np.log(_RARELY) / max(count, 1)))),
-            systematic=systematic_rms(whitened[best][joint], colours[best][joint]),
+            systematic=systematic_rms(whitened[best][joint], colours[best][joint], band),
             numerics=float(numerics[joint]),
         )
         loud = power > _LOUDER**2 + _SCATTER / np.sqrt(max(count, 1))
@@ -296,9 +297,9 @@ def _decided(found: Residual, count: int, *, loud: bool, stated: bool) -> Residu
 
 
 def cumulated_excess(
-    z: Float[np.ndarray, " row"], colour: Float[np.ndarray, " f"] | float = 1.0
+    z: Float[np.ndarray, " row"], colour: Float[np.ndarray, " f"] | float = 1.0, band: float = _BAND
 ) -> tuple[float, int, float]:
-    """Return the largest excess of a series' cumulated periodogram over a white one in the filter's band.
+    """Return the largest excess of a series' cumulated periodogram over a white one in a band.
 
     Of a white series the excess stays below sqrt(-ln(p) / 2 m) with probability 1 - p, m being the number of
     frequencies.
@@ -306,6 +307,7 @@ def cumulated_excess(
     Args:
         z: Whitened residual, (row,).
         colour: Spectrum by which it is whitened further, at its frequencies above zero, (f,); 1: not at all.
+        band: Part of the half sampling rate that counts.
 
     Returns:
         The excess as a part of the power, the number of frequencies, and the mean power in the band.
@@ -315,7 +317,7 @@ def cumulated_excess(
         one-sided limit is that of Kolmogorov and Smirnov.
     """
     power = np.abs(np.fft.rfft(z))[1:] ** 2 / np.maximum(colour, 1e-300)
-    power = power[: int(_BAND * len(power))]
+    power = power[: int(band * len(power))]
     count, total = len(power), float(power.sum())
     if count == 0 or total <= 0:
         return 0.0, count, 0.0
@@ -323,20 +325,21 @@ def cumulated_excess(
     return float(excess), count, total / count / len(z)
 
 
-def systematic_rms(z: Float[np.ndarray, " row"], noise: NoiseModel) -> float:
+def systematic_rms(z: Float[np.ndarray, " row"], noise: NoiseModel, band: float = _BAND) -> float:
     """Return the RMS of what a residual holds beyond its noise at low frequencies, in the residual's unit.
 
     Args:
         z: Whitened residual, (row,).
         noise: Model of the noise by which it was whitened.
+        band: Part of the half sampling rate that counts.
     """
     power = np.abs(np.fft.rfft(z))[1:] ** 2 / len(z)
-    band = int(_BAND * len(power))
-    if band == 0:
+    count = int(band * len(power))
+    if count == 0:
         return 0.0
-    beyond = power[:band] - 1.0
-    end = int(np.argmax(np.cumsum(power[:band] - np.mean(power[:band])))) + 1
-    density = noise.density(len(z))[1 : band + 1]
+    beyond = power[:count] - 1.0
+    end = int(np.argmax(np.cumsum(power[:count] - np.mean(power[:count])))) + 1
+    density = noise.density(len(z))[1 : count + 1]
     return float(np.sqrt(max(2 * np.sum((beyond * density)[:end]) / len(z), 0.0)))
 
 
