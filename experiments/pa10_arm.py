@@ -15,7 +15,6 @@ from jaxid.arms.base_by_rules import base_parameters_by_rules
 from jaxid.arms.base_parameters import base_parameters, inertial_regressor
 from jaxid.dynamics.residuals import balance_along
 from jaxid.estimators import steps_of
-from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.experiment_design.along_reference import Excitation
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
@@ -177,17 +176,14 @@ def identification(folder: Path) -> None:
     cells = lambda x: [f"{x:.3f}" for x in x]
     table.row("", "the noise alone", "", "", *cells(_rms(noise, other) / NOISE), "")
     for what, text, methods in (
-        ("base parameters", base, (*METHODS, "reweighted")),
+        ("base parameters", base, METHODS),
         ("links that bodies can be", whole, CONSISTENT),
     ):
         (folder / "arm.toml").write_text(text)
         session = jaxid.open_session(folder / "arm.toml", log, method="inverse_dynamics")
         for method in methods:
             start = time.perf_counter()
-            if method == "reweighted":
-                found = inverse_dynamics(session.machine, session.fit.data, reweighted=True)
-            else:
-                found = run_alone(steps_of(method, session))
+            found = run_alone(steps_of(method, session))
             seconds = f"{time.perf_counter() - start:.0f}"
             left = _left(found.machine.plant, other, measured) / NOISE
             table.row(what, method, found.converged, found.steps, *cells(left), seconds)

@@ -16,6 +16,7 @@ import scipy.linalg
 
 from jaxid.errors import InputError
 from jaxid.estimators.common.endogeneity import endogeneity
+from jaxid.estimators.common.joint_weights import joint_weights
 from jaxid.estimators.common.rerun import Rerun, best_step, lost, settled, span
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps as of_one
@@ -75,7 +76,8 @@ class _Balance:
         rerun: The simulation.
         plant: The plant with the friction of the log's speeds.
         arrays: The prepared log.
-        size: 2-norm of the measured force.
+        size: 2-norm of the weighted measured force.
+        weight: Weight of each joint by what least squares leaves of it, (n,).
     """
 
     part: Part
@@ -83,6 +85,7 @@ class _Balance:
     plant: Plant
     arrays: ForceData
     size: float
+    weight: np.ndarray
 
     @classmethod
     def steps(cls, part: Part, theta: np.ndarray, numerics: Numerics | None) -> Steps[_Balance]:
@@ -91,8 +94,12 @@ class _Balance:
             part = replace(part, machine=replace(part.machine, controller=None))
         rerun = Rerun.of(part.at(theta), part.log, part.data, numerics)
         plant, arrays = sharpened(part.machine.plant, part.data), ForceData.of(part.data, part.data.fitted)
-        size = yield SolveRequest(force_size, (plant, arrays))
-        return cls(part, rerun, plant, arrays, float(size))
+        rows, own = part.data.fitted, theta[part.index]
+        e, _ = yield SolveRequest(force_and_columns, (plant, part.machine.parameters.places, arrays, own))
+        weight = joint_weights(np.where(rows, np.asarray(e), 0.0), rows)
+        weight = np.ones(rows.shape[1]) if weight is None else weight
+        size = yield SolveRequest(force_size, (plant, replace(arrays, weight=rows * weight)))
+        return cls(part, rerun, plant, arrays, float(size), weight)
 
     @property
     def rows(self) -> np.ndarray:
@@ -100,10 +107,11 @@ class _Balance:
         return self.part.data.fitted
 
     def along(self, data: ForceData, theta: np.ndarray) -> Steps[tuple[np.ndarray, np.ndarray]]:
-        """Compute the residual force along a motion, and its Jacobian by the unknowns of all logs."""
+        """Compute the weighted residual force along a motion, and its Jacobian by all unknowns."""
         own, places = theta[self.part.index], self.part.machine.parameters.places
         e, columns = yield SolveRequest(force_and_columns, (self.plant, places, data, own))
-        return np.asarray(e), self.part.widened(np.asarray(columns), theta.size)
+        wide = self.part.widened(np.asarray(columns), theta.size)
+        return np.asarray(e) * self.weight, wide * self.weight[:, None]
 
 
 def instrumental_variable_steps(
@@ -111,7 +119,8 @@ def instrumental_variable_steps(
 ) -> Steps[Estimate]:
     """Run `instrumental_variable` on one log or several as a generator of solve requests.
 
-    The equations of several logs are added, each over the variance of its log's noise.
+    The equations of several logs are added, each over the variance of its log's noise. Those of each joint
+    are weighted as in `inverse_dynamics`.
 
     Args:
         machine: Machine of all logs, with their unknowns.
@@ -159,7 +168,12 @@ def instrumental_variable_steps(
         precision=precision,
         converged=converged,
         message=found.message,
-        residual=np.concatenate([np.where(row.counts, row.residual, np.nan) for row in on_instruments]),
+        residual=np.concatenate(
+            [
+                np.where(row.counts, row.residual / log.weight, np.nan)
+                for row, log in zip(on_instruments, logs, strict=True)
+            ]
+        ),
         samples=sum(int(row.counts.sum()) for row in on_instruments),
         steps=found.steps,
         notes=tuple(notes),

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxid.arrays import Array
+from jaxid.estimators.common.joint_weights import joint_weights
 from jaxid.estimators.common.levenberg_marquardt import DAMPING, Minimum, Transform, levenberg_marquardt
 from jaxid.estimators.common.shapes import other_starts
 from jaxid.estimators.estimate import Estimate
@@ -44,7 +45,7 @@ def solve_balance(
     bounds: tuple[Array, Array],
     damping: float,
 ) -> tuple[Minimum, Array]:
-    """Return the fit, and the 2-norm of the measured force."""
+    """Return the fit, and the 2-norm of the weighted measured force."""
 
     def residual(theta: Array) -> Array:
         return data.weight * force_residual(scatter(places, plant, theta), data)
@@ -53,30 +54,28 @@ def solve_balance(
     return fit, size_of_force(plant, data)
 
 
-def inverse_dynamics(
-    machine: Machine, data: Prepared, *, reweighted: bool = False, start: np.ndarray | None = None
-) -> Estimate:
+def inverse_dynamics(machine: Machine, data: Prepared, *, start: np.ndarray | None = None) -> Estimate:
     """Fit the unknowns to a prepared log by least squares on the balance of forces.
+
+    The rows of each joint count over the RMS of what a first fit leaves of them.
 
     Args:
         machine: The machine; its guesses matter only for unknowns in which the balance is nonlinear.
         data: The prepared log.
-        reweighted: Whether to fit twice more, with joints weighted by the spread of their residuals and
-            samples by a robust (bisquare) weight.
         start: Start of the fit in place of the guesses, (p,).
 
     Returns:
         The estimate; its covariance accounts for a coloured residual.
 
     Source:
-        Gautier (1986) and Janot, Vandanjon & Gautier (2014) for filtered inverse dynamics; Tukey's
-        bisquare with constant 4.685 for the weights of samples. Gautier (1997), ICRA, for those of joints.
+        Gautier (1986) and Janot, Vandanjon & Gautier (2014) for filtered inverse dynamics; Gautier (1997),
+        ICRA, for the weights of joints.
     """
-    return run_alone(inverse_dynamics_steps(machine, data, reweighted=reweighted, start=start))
+    return run_alone(inverse_dynamics_steps(machine, data, start=start))
 
 
 def inverse_dynamics_steps(
-    machine: Machine, data: Prepared, *, reweighted: bool = False, start: np.ndarray | None = None
+    machine: Machine, data: Prepared, *, start: np.ndarray | None = None
 ) -> Steps[Estimate]:
     """Run `inverse_dynamics` as a generator of solve requests."""
     plant = sharpened(machine.plant, data)
@@ -103,15 +102,12 @@ def inverse_dynamics_steps(
     lowest = [f for f, c in zip(fits, costs, strict=True) if c <= min(costs) * (1 + 1e-6)]
     fit = next((f for f in lowest if bool(f.converged)), lowest[0])
 
-    for _ in range(2 if reweighted else 0):
-        e = np.asarray(fit.residual).reshape(data.moving.shape)
-        was = np.asarray(arrays.weight)
-        # A sample with zero weight keeps zero weight.
-        e = np.where(was > 0, e / np.where(was > 0, was, 1.0), np.inf)
-        arrays = eqx.tree_at(lambda a: a.weight, arrays, _robust(e, rows))
-        fit, _ = yield SolveRequest(solve_balance, (plant, places, arrays, fit.theta, *options))
+    weights = joint_weights(np.asarray(fit.residual).reshape(rows.shape), rows)
+    if weights is not None:
+        arrays = eqx.tree_at(lambda a: a.weight, arrays, rows * weights)
+        fit, size = yield SolveRequest(solve_balance, (plant, places, arrays, fit.theta, *options))
 
-    e = np.asarray(fit.residual).reshape(rows.shape)
+    e, weight = np.asarray(fit.residual).reshape(rows.shape), np.asarray(arrays.weight)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
     precision = force_precision(machine, size, np.asarray(fit.theta), e, jacobian, rows)
     if data.faster_loop and np.all(np.isfinite(jacobian)):
@@ -124,7 +120,7 @@ def inverse_dynamics_steps(
         precision=precision,
         converged=converged,
         message="converged" if converged else f"no convergence within {int(fit.steps)} steps",
-        residual=np.where(rows, e, np.nan),
+        residual=np.where(rows, e / np.where(weight > 0, weight, 1.0), np.nan),
         samples=int(rows.sum()),
         steps=int(fit.steps),
         std_misspecified=std_under_misspecification(jacobian, e, rows),
@@ -205,12 +201,3 @@ def force_precision(
     guess = machine.parameters.guess
     scale = np.where(guess != 0, guess, 1.0)
     return assess(machine.parameters.names, jacobian, e, rows, float(size), scale)
-
-
-def _robust(e: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return weights of residuals: RMS spread over each joint's spread, times the root of the bisquare."""
-    middle = [np.median(np.abs(x[c])) if c.any() else 0.0 for x, c in zip(e.T, counts.T, strict=True)]
-    spread = 1.4826 * np.array(middle)
-    spread = np.where(spread > 0, spread, 1.0)
-    ratio = np.minimum(np.abs(e) / (4.685 * spread), 1.0)
-    return counts * (1 - ratio**2) * np.sqrt(np.mean(spread**2)) / spread

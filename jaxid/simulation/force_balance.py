@@ -223,9 +223,9 @@ def sharpened(plant: Plant, data: Prepared) -> Plant:
 
 
 def size_of_force(plant: Plant, data: ForceData) -> Float[Array, ""]:
-    """Return the 2-norm of the measured force at the samples that count; of a free motion that of M qdd."""
+    """Return the 2-norm of the measured force times the weights; of a free motion that of M qdd."""
     force = inertial_force(plant, data) if data.passive else measured_force(plant, data)
-    return jnp.linalg.norm(jnp.where(data.weight > 0, force, 0.0))
+    return jnp.linalg.norm(data.weight * force)
 
 
 def inertial_force(plant: Plant, data: ForceData) -> Float[Array, "kept n"]:

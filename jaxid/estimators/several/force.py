@@ -11,6 +11,7 @@ import scipy.sparse
 from jaxid.estimators.algebraic.windows import kernels_of as algebraic_kernels
 from jaxid.estimators.algebraic.windows import windows_and_columns, windows_without_rest
 from jaxid.estimators.common.best_bodies import best_bodies
+from jaxid.estimators.common.joint_weights import joint_weights
 from jaxid.estimators.common.shapes import other_starts
 from jaxid.estimators.common.windowed import Kernels, row_covariance_steps, weights_of_rows
 from jaxid.estimators.estimate import Estimate
@@ -63,13 +64,26 @@ class Equations:
         return Rows(wide, e, self.counts, self.signal, weight, self.covariance)
 
     def weighed_steps(self, part: Part, theta: np.ndarray, rows: Rows) -> Steps[Equations]:
-        """Return the equations weighed by the variance of each row at values of the unknowns of all logs."""
-        assert self.kernels is not None, "these equations have windows"
+        """Return the equations weighed by the variance of each row at values of the unknowns of all logs.
+
+        Balances of forces count by joint. The signal of their rows is then that of the weighted rows.
+        """
+        if self.kernels is None:
+            return (yield from self._by_joint_steps(part, rows))
         covariance = yield from row_covariance_steps(part.at(theta), part.data, self.kernels, part.log)
         if not np.all(np.isfinite(covariance.data)):
             return self
         factor, covariance = weights_of_rows(rows, covariance)
         return replace(self, factor=factor, covariance=covariance)
+
+    def _by_joint_steps(self, part: Part, rows: Rows) -> Steps[Equations]:
+        weights = joint_weights(rows.residual, self.counts)
+        if weights is None:
+            return self
+        factor, plant = self.counts * weights, self.arguments[0]
+        arrays = replace(ForceData.of(part.data, self.counts), weight=factor)
+        signal = float((yield SolveRequest(force_size, (plant, arrays))))
+        return replace(self, factor=factor, signal=signal)
 
 
 def inverse_dynamics_steps(machine: Machine, parts: Sequence[Part]) -> Steps[Estimate]:
@@ -152,7 +166,7 @@ def least_squares_steps(
         ends.append((yield from fit(scale.inward(at), first)))
     best = min(ends, key=lambda end: np.nan_to_num(end.model.cost, nan=np.inf))
     found, weights = yield from descended_steps(fit, best.x, first)
-    if found.model.finite and all(own.kernels is not None for own in equations):
+    if found.model.finite:
         at, logs = scale.outward(found.x)[0], found.model.content
         for k, (part, own, rows) in enumerate(zip(parts, list(equations), logs, strict=True)):
             equations[k] = yield from own.weighed_steps(part, at, rows)
