@@ -186,6 +186,7 @@ def main() -> int:
     parser.add_argument("-o", metavar="DIR", type=Path, default=HERE)
     options = parser.parse_args()
     measured_folder(parser, "tx40")
+    options.o.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         folder, begin = Path(name), time.process_time()
         found = fitted(folder)

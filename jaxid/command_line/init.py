@@ -18,8 +18,12 @@ def add(commands: Commands) -> None:
     purpose = "write a first case from a raw log"
     parser = add_long_command(commands, "init", purpose, run, examples=_EXAMPLES)
     parser.add_argument("log", metavar="LOG", help="the log, as the drive or the robot wrote it")
-    parser.add_argument("--urdf", metavar="FILE", help="file that describes the arm of the log")
-    parser.add_argument("--tip", metavar="LINK", help="its last link; needed only where the chain branches")
+    parser.add_argument("--urdf", metavar="FILE", help="file that describes the robot of the log")
+    parser.add_argument(
+        "--tip",
+        metavar="LINK",
+        help="its last link whose joints the log has; else all joints, or those that the log names",
+    )
     parser.add_argument("--mjcf", metavar="FILE", help="MuJoCo model of the robot of the log")
     parser.add_argument(
         "-o", metavar="CASE.toml", default="case.toml", help="file to write the case to; default: case.toml"

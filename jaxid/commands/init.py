@@ -16,7 +16,7 @@ from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.first_case.columns import Chosen, choose, columns_of
 from jaxid.first_case.drafting import Draft
-from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_arm, of_tree
+from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_robot
 from jaxid.first_case.raw import raw_log
 from jaxid.first_case.section import Section, case_text
 from jaxid.first_case.units import measures_of
@@ -106,18 +106,16 @@ def init(
     tip: str | None = None,
     mjcf: str | Path | None = None,
     folder: str | Path = ".",
-    tree: bool = False,
     unknown: Sequence[str] | None = None,
 ) -> FirstCase:
     """Write a first case from a raw log: columns, units, sensors, and rough guesses of the unknowns.
 
     Args:
         log: The file, or a table in memory (DataFrame, Dataset, dict).
-        urdf: File that describes the arm of the log; None: an axis.
-        tip: Name of its last link; None: there is only one way to go.
+        urdf: File that describes the robot of the log.
+        tip: Name of its last link whose joints the log has; None: all joints, or those that the log names.
         mjcf: MuJoCo model of the robot of the log.
         folder: Folder in which the case will stand, for the path of the robot's file in it.
-        tree: Whether a URDF file is taken for a tree, with its friction, in place of an arm.
         unknown: Words of `[plant] unknown` for a robot's file; None: all that a log of its kind shows.
 
     Raises:
@@ -133,15 +131,12 @@ def init(
         raise InputError("a Log has its columns already", where=log.source, hint=hint)
 
     raw = raw_log(log)
-    robot = _robot(mjcf, urdf if tree else None)
-    names = () if robot is None else tuple(joint.name for joint in robot.free)
+    robot = _robot(mjcf, urdf)
+    names = () if robot is None else _joints_of(robot, urdf, tip)
     chosen = choose(columns_of(raw.data, raw.units, raw.contents.time, names), raw.source)
-    arm = None if urdf is None or robot is not None else read_urdf(urdf, tip)
     if robot is not None:
         actuated = {drive.joint for drive in robot.drives}
-        chosen = of_tree(chosen, names, actuated, robot.file, raw.source)
-    elif arm is not None:
-        chosen = of_arm(chosen, arm, str(urdf), raw.source)
+        chosen = of_robot(chosen, names, actuated, robot.file, raw.source, to_tip=tip is not None)
     elif len(chosen.joints) > 1:
         need_forces(chosen, raw.source)
         chosen = most_moved(chosen)
@@ -154,9 +149,6 @@ def init(
         sections = draft.tree(robot, Path(robot.file), key, chosen.joints, words)
     elif not chosen.force:
         sections = draft.without_force()
-    elif arm is not None:
-        assert urdf is not None, "an arm is read from it"
-        sections = draft.arm(arm, Path(urdf), tip)
     else:
         sections = draft.axis()
     first = _first_case(raw.source, Path(folder), sections)
@@ -181,6 +173,15 @@ def _robot(mjcf: str | Path | None, urdf: str | Path | None) -> Robot | None:
     if mjcf is not None:
         return read_mjcf(mjcf)
     return None if urdf is None else read_urdf_tree(urdf)
+
+
+def _joints_of(robot: Robot, urdf: str | Path | None, tip: str | None) -> tuple[str, ...]:
+    """Return the names of a robot's free joints, or of those up to a tip of its URDF file."""
+    names = tuple(joint.name for joint in robot.free)
+    if urdf is None or tip is None:
+        return names
+    to_tip = read_urdf(urdf, tip).names
+    return tuple(name for name in names if name in to_tip)
 
 
 def _motion_of(robot: Robot, name: str) -> str:

@@ -153,7 +153,7 @@ def _read(path: Path) -> Robot:
 
 def _first(path: Path, log: LogLike, unknown: tuple[str, ...] | None, folder: Path) -> FirstCase:
     if path.suffix.lower() == ".urdf":
-        return init(log, urdf=path, tree=True, unknown=unknown, folder=folder)
+        return init(log, urdf=path, unknown=unknown, folder=folder)
     return init(log, mjcf=path, unknown=unknown, folder=folder)
 
 

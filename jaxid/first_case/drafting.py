@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from jaxid.case.robot import Robot
-from jaxid.case.urdf import Urdf
 from jaxid.first_case.balance import FreeSwing, RoughBalance, free_swing, rough_balance
 from jaxid.first_case.columns import NO_TIME_RATE, Chosen, Column
 from jaxid.first_case.joints import lacking_force
@@ -67,40 +66,6 @@ class Draft:
             table.questions.append("is a positive force one that drives a positive velocity?")
         plant, effects = self._plant(rough), self._effects(rough)
         return [*plant, *effects, table, *self._sensor(log)]
-
-    def arm(self, arm: Urdf, urdf: Path, tip: str | None) -> list[Section]:
-        """Return the case of an arm from a URDF file."""
-        measures = self._measures
-        plant = Section("[plant]", {"kind": "serial_arm", "urdf": _relative(urdf, self._folder)})
-        if tip is not None:
-            plant.keys["tip"] = tip
-        plant.keys["unknown"] = "base"
-        plant.notes["unknown"] = (
-            'sums of link parameters that torques show; "none": those of the file are right'
-        )
-        if measures.labels:
-            plant.keys["units"] = measures.labels
-            plant.questions.append(measures.questions["force"])
-        plant.questions.append(
-            "does gravity act along -z of the first link? Else gravity_vector = [x, y, z] in m/s^2"
-        )
-
-        table = self._log_table(arm.names)
-        log = self._read(table)
-        rough = []
-        for k in range(self._joints):
-            others = [log.position[:, j] for j in range(self._joints)]
-            one = rough_balance(log.force[:, k], log.position[:, k], log.period, rotary=True, others=others)
-            rough.append(one)
-
-        frictions = [
-            Section("[[effects]]", {"kind": kind, key: {"guess": [_positive(r, name) for r in rough]}})
-            for kind, key, name in (
-                ("viscous_friction", "coefficient", "viscous"),
-                ("coulomb_friction", "level", "coulomb"),
-            )
-        ]
-        return [plant, *frictions, table, *self._sensor(log)]
 
     def tree(
         self, robot: Robot, path: Path, key: str, names: Sequence[str], unknown: Sequence[str]

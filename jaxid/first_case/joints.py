@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxid.case.urdf import Urdf
 from jaxid.errors import InputError
 from jaxid.first_case.columns import Chosen, Column
 from jaxid.first_case.words import meaning_of
@@ -20,8 +19,14 @@ _SOME_FORCES_HINT = (
 )
 
 
-def of_tree(
-    chosen: Chosen, names: tuple[str, ...], actuated: Collection[str], file: str, where: str
+def of_robot(
+    chosen: Chosen,
+    names: tuple[str, ...],
+    actuated: Collection[str],
+    file: str,
+    where: str,
+    *,
+    to_tip: bool = False,
 ) -> Chosen:
     """Return the columns of a robot's joints, in their order: of all, or of those that the log names.
 
@@ -31,6 +36,7 @@ def of_tree(
         actuated: Names of those that its actuators drive; empty: all.
         file: The robot's file, for messages.
         where: The log, for messages.
+        to_tip: Whether the names are those up to a tip, which the log must all have.
 
     Raises:
         InputError: If the joints of the log are not those of the robot.
@@ -38,8 +44,8 @@ def of_tree(
     # Columns may hold the names as they are, or their words.
     keys = [n if n in chosen.joints else " ".join(meaning_of(n).joint) for n in names]
     found = [k for k, key in enumerate(keys) if key and key in chosen.joints and keys.count(key) == 1]
-    if not found or len(found) == len(names) or len(chosen.joints) == len(names):
-        picked = _of_joints(chosen, names, keys, file, where, "")
+    if to_tip or not found or len(found) == len(names) or len(chosen.joints) == len(names):
+        picked = _of_joints(chosen, names, keys, file, where, " up to that tip" if to_tip else "")
     else:
         some, words = tuple(names[k] for k in found), [keys[k] for k in found]
         picked = _of_joints(chosen, some, words, file, where, "; the others are held at zero")
@@ -70,12 +76,6 @@ def _with_forces_of_driven(chosen: Chosen, actuated: Collection[str], file: str)
     return replace(chosen, force=force, driven=driven, said=(*chosen.said, said))
 
 
-def of_arm(chosen: Chosen, arm: Urdf, urdf: str, where: str) -> Chosen:
-    """Return the columns of an arm's joints, in their order."""
-    keys = [" ".join(meaning_of(name).joint) for name in arm.names]
-    return _of_joints(chosen, arm.names, keys, urdf, where, " up to that tip")
-
-
 def _of_joints(
     chosen: Chosen, names: tuple[str, ...], keys: list[str], file: str, where: str, which: str
 ) -> Chosen:
@@ -102,7 +102,7 @@ def _of_joints(
     else:
         listed = ", ".join(f"'{j}'" for j in chosen.joints)
         hint = "rename the columns by the joints, or the joints by joints = [...] in a case"
-        if which.startswith(" "):
+        if file.endswith(".urdf"):
             hint = "name the tip whose joints the log has by --tip, or rename the columns"
         raise InputError(
             f"columns of {listed}, and {Path(file).name} moves {', '.join(names)}", where=where, hint=hint
@@ -152,6 +152,6 @@ def most_moved(chosen: Chosen) -> Chosen:
     joint = int(np.argmax(ways))
     name = columns[joint].name
     said = f"the log has {len(columns)} joints: the case is of that of '{name}' alone, which moves most"
-    question = "a model of all joints? jaxid init LOG --urdf FILE --tip LINK; alone, coupling counts as noise"
+    question = "a model of all joints? jaxid init LOG --urdf FILE; alone, coupling counts as noise"
     one = chosen.only(joint)
     return replace(one, said=(*one.said, said), questions={**one.questions, "joints": question})

@@ -141,6 +141,7 @@ def test_a_bag_with_a_urdf(tmp_path, capsys):
     assert "columns belong to the joints of arm.urdf by their names" in ran.out
     tables = jaxid.load_case(case).tables
     assert tables["plant"]["urdf"] == "../arm.urdf"
+    assert "armature" in tables["plant"]["unknown"]
     assert tables["log"]["force"] == {
         "shoulder_joint": "/joint_states.effort[shoulder_joint]",
         "elbow_joint": "/joint_states.effort[elbow_joint]",
@@ -159,8 +160,9 @@ def test_a_bag_with_a_urdf(tmp_path, capsys):
 
     one = jaxid.init(bag)
     assert any("2 joints: the case is of that of" in line for line in one.assumed)
-    assert any("--urdf FILE --tip LINK" in line for line in one.questions)
+    assert any("--urdf FILE" in line for line in one.questions)
     part = jaxid.init(bag, urdf=urdf, tip="upper")
+    assert part.tables["plant"]["joints"] == ["shoulder_joint"]
     assert any("those of 'elbow' are no joints up to that tip" in line for line in part.assumed)
     third = {f"{name}_wrist": np.ones(100) * np.arange(100) for name in ("t", "position", "effort")}
     with pytest.raises(
