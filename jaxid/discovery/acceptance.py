@@ -15,6 +15,7 @@ from jaxid.discovery.domain import Domain, ForceDomain, Samples
 from jaxid.discovery.noise import NUMERICS
 from jaxid.discovery.selection import TIE_NATS
 from jaxid.logs.prepare import Prepared
+from jaxid.model.plant import inertia_at
 from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.simulation.sensor_noise import force_noise
 
@@ -37,6 +38,9 @@ _DRAWN = 1e-3
 # A mass of the machine, or another positive parameter of its plant, is next to nothing below this part of its
 # value without an effect.
 _NOTHING = 0.1
+
+# A load behind a spring is a part of the joint's inertia; one that is so many times as large is none.
+_HEAVIER = 1.25
 
 
 @dataclass
@@ -236,6 +240,10 @@ class Acceptance:
         if lost:
             return f"{lost} would be next to nothing beside it, as if only signs of the force had to agree"
 
+        heavier = self._heavier_load(index, new)
+        if heavier:
+            return f"{heavier} would be more than the inertia of the joint, of which it is a part"
+
         e = self.residual(new)
         if self._sum(e) < self._least(fitted) * self._sure_noise.sum():
             return "it removes more than the sensors' noise allows"
@@ -263,6 +271,18 @@ class Acceptance:
         usual[: len(self.guess)] = np.minimum(usual[: len(self.guess)], self.guess)
         for f, least, after in zip(self.superset.machine.parameters.free, usual, new, strict=True):
             if f.effect is None and f.sign == "positive" and after < _NOTHING * least:
+                return f.name
+        return ""
+
+    def _heavier_load(self, index: np.ndarray, new: np.ndarray) -> str:
+        """Return the name of an added load behind a spring that exceeds the inertia of its joint."""
+        machine = self.superset.machine
+        plant = machine.with_estimate(new).plant
+        for i in index:
+            f = machine.parameters.free[i]
+            if f.effect is None or f.path[-1] != "load_inertia" or not plant.effects[f.effect].adds_spring:
+                continue
+            if new[i] > _HEAVIER * inertia_at(plant, int(plant.effects[f.effect].port)):
                 return f.name
         return ""
 

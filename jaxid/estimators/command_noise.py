@@ -136,9 +136,12 @@ def corrected_steps(fit: JointLikelihood, end: Maximum) -> Steps[Corrected]:
     doubt = np.abs((yield from without(parabola)) - found) if bent else as_it_is.doubt
     more = growth_of_gap(fit, end.theta, found)
     if more > _WORSE:
+        left = (
+            f"leave {more:.3g} times as much of the measured force" if np.isfinite(more) else "give no force"
+        )
         note = (
             "the values were not corrected for noise with which the command was read: the corrected ones "
-            f"leave {more:.3g} times as much of the measured force, so that a part of this noise is none"
+            f"{left}, so that a part of this noise is none"
         )
         return replace(as_it_is, refused=note)
     return Corrected(found, reads, doubt)
@@ -196,7 +199,7 @@ def growth_of_gap(
 
     Returns:
         Ratio of the RMS forces over all logs, as a root mean square over the driven joints; one where the
-        correction is small, or where a joint has no encoder.
+        correction is small, or where a joint has no encoder; infinite where corrected values give no force.
     """
     from jaxid.gap import force_gap
 
@@ -212,7 +215,10 @@ def growth_of_gap(
     for theta in (fitted, corrected):
         gaps = [force_gap(part.at(theta), part.prepared or _prepared(part)) for part in parts]
         squares.append(sum(gap.rms[driven] ** 2 for gap in gaps))
-    return float(np.sqrt(np.nanmean(squares[1] / squares[0])))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = squares[1] / squares[0]
+    ratios = ratios[np.isfinite(ratios)]
+    return float(np.sqrt(np.mean(ratios))) if ratios.size else np.inf
 
 
 def _prepared(part: Part) -> Prepared:

@@ -19,6 +19,7 @@ from jaxid.arrays import Array
 from jaxid.model.balance import Balance, balance, stacked
 from jaxid.model.effect import Effect
 from jaxid.model.interface import PlantInterface
+from jaxid.model.parameter import parameters_of
 from jaxid.model.smoothing import Smoothing
 
 
@@ -119,3 +120,18 @@ class Plant(PlantInterface):
             Residual `M qdd + h - effects - drive`, levels of dry friction, rates of the states, drive.
         """
         return balance(self, q, qd, qdd, u, t, states, reaction)
+
+
+def inertia_at(plant: Plant, joint: int) -> float:
+    """Return the inertia of a joint, its added masses included; infinite if it varies with the position."""
+    constant = plant.own_inertia()
+    if constant is None:
+        return np.inf
+    added = [
+        float(np.sum(np.asarray(getattr(e, name))))
+        for e in plant.effects
+        if e.port == joint and not e.adds_spring
+        for name, info in parameters_of(type(e)).items()
+        if info.dimension == "inertia" and getattr(e, name) is not None
+    ]
+    return float(np.atleast_1d(np.asarray(constant))[joint]) + sum(added)

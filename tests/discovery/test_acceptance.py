@@ -222,6 +222,22 @@ def test_a_limit_that_leaves_no_inertia_is_turned_down(axis):
     assert why.startswith("inertia would be next to nothing beside it")
 
 
+def test_a_load_heavier_than_its_joint_is_turned_down(axis):
+    _, search = axis
+    names = search.superset.machine.parameters.names
+    candidate = next(c for c in search.superset.candidates if c.kind == "joint_flexibility")
+    load = next(i for i in candidate.index if names[i].endswith("load_inertia"))
+    whole = search.theta[names.index("inertia")]
+
+    def objection(ratio: float) -> str:
+        new = search.theta.copy()
+        new[candidate.index] = np.where(np.array(candidate.index) == load, ratio * whole, 1e4)
+        return search.acceptance.objection(np.array(candidate.index), search.theta, new, None, None, 5)
+
+    assert objection(2.0).startswith("joint_flexibility.load_inertia would be more than the inertia")
+    assert "more than the inertia" not in objection(0.5)
+
+
 def test_a_joint_with_little_noise_counts_for_little():
     """Weighted sums of squares: what a true model leaves seldom, of a loud joint and a quiet one."""
     floors, counts = np.array([1.0, 0.1]), np.array([20, 20])

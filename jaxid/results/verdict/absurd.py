@@ -9,7 +9,7 @@ import numpy as np
 from jaxid.consistency.weight import least_inertia
 from jaxid.estimators.estimate import Estimate
 from jaxid.model.parameter import ParameterInfo, parameters_of
-from jaxid.model.plant import Plant
+from jaxid.model.plant import Plant, inertia_at
 from jaxid.model.unknowns import Free, in_loop
 from jaxid.plants.link_tree import LinkTree
 from jaxid.results.report.numbers import plain, pretty_unit, with_std
@@ -113,7 +113,7 @@ def _more_than_whole(estimate: Estimate, f: Free, value: float, std: float) -> R
     plant = estimate.machine.plant
     if f.effect is None or f.path[-1] != "load_inertia" or not plant.effects[f.effect].adds_spring:
         return None
-    whole = _inertia_at(plant, int(plant.effects[f.effect].port))
+    whole = inertia_at(plant, int(plant.effects[f.effect].port))
     if value <= whole:
         return None
     text = (
@@ -121,21 +121,6 @@ def _more_than_whole(estimate: Estimate, f: Free, value: float, std: float) -> R
         f"inertia, and exceeds it, {_with_unit(whole, f.unit)}"
     )
     return Remark(f.name, text, impossible=value - _SIGMAS * std > whole, forbids=True)
-
-
-def _inertia_at(plant: Plant, joint: int) -> float:
-    """Return the inertia of a joint, its added masses included; infinite if it varies with the position."""
-    constant = plant.own_inertia()
-    if constant is None:
-        return np.inf
-    added = [
-        float(np.sum(np.asarray(getattr(e, name))))
-        for e in plant.effects
-        if e.port == joint and not e.adds_spring
-        for name, info in parameters_of(type(e)).items()
-        if info.dimension == "inertia" and getattr(e, name) is not None
-    ]
-    return float(np.atleast_1d(np.asarray(constant))[joint]) + sum(added)
 
 
 def _too_fine(session: Session, f: Free, value: float, info: ParameterInfo | None) -> Remark | None:

@@ -29,6 +29,8 @@ from jaxid.simulation.sensor_noise import high_band_force_noise, position_noise
 
 # Part of the half sampling rate of positions that counts.
 _BAND = 0.8
+# Part of the filter's band that counts for a force: up to there a tenth of the noise's power passes.
+_INSIDE = 0.7
 # A systematic part below this many `NUMERICS` of the force may be an error of filtering and integration.
 _NUMERICS = 2.0
 # Fewer frequencies than this in the band show no colour.
@@ -129,8 +131,8 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
     # A joint of an arm may have a thousandth of another's torque; a joint without a drive has none.
     sizes = np.sqrt(np.mean(gap.measured**2, axis=0))
     numerics = _NUMERICS * NUMERICS * np.where(sizes > 0, sizes, size)
-    # Beyond the filter's band the residual is rounding and errors of numerics.
-    band = run.data.recipe.filled
+    # Near the edge of the filter's band and beyond, the residual is rounding and errors of numerics.
+    band = _INSIDE * run.data.recipe.filled
     least = _EXCESS if fitted else _EXCESS_ELSEWHERE
     out = []
     for joint in joints:
