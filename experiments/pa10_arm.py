@@ -148,8 +148,8 @@ def identification(folder: Path) -> None:
     friction sticks exactly, in steps of 0.1 ms. Encoders have noise of 1e-6 rad, torques that of the case.
     The other motion is the design for the condition number, its torques known to the same noise.
 
-    Hypothesis: of every method it is below 1.05, by joint. It holds (1.046 at worst, where the noise alone is
-    1.042) but for power, 1.04 to 1.69. Its equation allows no better than 1.07 to 1.37: beside the methods
+    Hypothesis: of every method it is below 1.05, by joint. It holds (1.042 at worst, where the noise alone is
+    1.041) but for power, 1.10 to 2.01. Its equation allows no better than 1.08 to 1.36: beside the methods
     stands what the best estimate by either equation would leave, all samples of joints that move counted by
     their noise.
     """

@@ -96,7 +96,7 @@ class _Balance:
         plant, arrays = sharpened(part.machine.plant, part.data), ForceData.of(part.data, part.data.fitted)
         rows, own = part.data.fitted, theta[part.index]
         e, _ = yield SolveRequest(force_and_columns, (plant, part.machine.parameters.places, arrays, own))
-        weight = joint_weights(np.where(rows, np.asarray(e), 0.0), rows)
+        weight = joint_weights(plant, np.where(rows, np.asarray(e), 0.0), rows)
         weight = np.ones(rows.shape[1]) if weight is None else weight
         size = yield SolveRequest(force_size, (plant, replace(arrays, weight=rows * weight)))
         return cls(part, rerun, plant, arrays, float(size), weight)

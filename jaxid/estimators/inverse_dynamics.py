@@ -57,7 +57,7 @@ def solve_balance(
 def inverse_dynamics(machine: Machine, data: Prepared, *, start: np.ndarray | None = None) -> Estimate:
     """Fit the unknowns to a prepared log by least squares on the balance of forces.
 
-    The rows of each joint count over the RMS of what a first fit leaves of them.
+    The rows of each driven joint count over the RMS of what a first fit leaves of them.
 
     Args:
         machine: The machine; its guesses matter only for unknowns in which the balance is nonlinear.
@@ -102,7 +102,7 @@ def inverse_dynamics_steps(
     lowest = [f for f, c in zip(fits, costs, strict=True) if c <= min(costs) * (1 + 1e-6)]
     fit = next((f for f in lowest if bool(f.converged)), lowest[0])
 
-    weights = joint_weights(np.asarray(fit.residual).reshape(rows.shape), rows)
+    weights = joint_weights(plant, np.asarray(fit.residual).reshape(rows.shape), rows)
     if weights is not None:
         arrays = eqx.tree_at(lambda a: a.weight, arrays, rows * weights)
         fit, size = yield SolveRequest(solve_balance, (plant, places, arrays, fit.theta, *options))

@@ -88,6 +88,17 @@ def test_chosen_band_holds_the_motion_and_not_the_noise():
     assert louder.edge < recipe.edge
 
 
+@pytest.mark.parametrize(
+    ("decimation", "edge", "filled"), [(1, 0.42, 0.42), (3, 0.22, 0.66), (5, 0.19, 0.8), (4, None, 0.8)]
+)
+def test_band_ends_where_the_decimation_leaves_it(decimation, edge, filled):
+    """One row in a whole number is kept, so that the band may end far below half the rate of the rows."""
+    chosen = choose_recipe(log_of(multisine(), noise=1e-4))
+    recipe = dataclasses.replace(chosen, decimation=decimation, edge=edge)
+    assert recipe.filled == pytest.approx(filled)
+    assert recipe.independent == pytest.approx(0.625 * filled)
+
+
 @pytest.mark.xfail(
     strict=True, reason="the band ends at 6.5 Hz, in the gap below the line at 8 Hz: see docs/case_file.md"
 )

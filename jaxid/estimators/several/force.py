@@ -77,10 +77,11 @@ class Equations:
         return replace(self, factor=factor, covariance=covariance)
 
     def _by_joint_steps(self, part: Part, rows: Rows) -> Steps[Equations]:
-        weights = joint_weights(rows.residual, self.counts)
+        plant = self.arguments[0]
+        weights = joint_weights(plant, rows.residual, self.counts)
         if weights is None:
             return self
-        factor, plant = self.counts * weights, self.arguments[0]
+        factor = self.counts * weights
         arrays = replace(ForceData.of(part.data, self.counts), weight=factor)
         signal = float((yield SolveRequest(force_size, (plant, arrays))))
         return replace(self, factor=factor, signal=signal)
