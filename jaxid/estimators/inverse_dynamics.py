@@ -104,8 +104,12 @@ def inverse_dynamics_steps(
 
     weights = joint_weights(plant, np.asarray(fit.residual).reshape(rows.shape), rows)
     if weights is not None:
-        arrays = eqx.tree_at(lambda a: a.weight, arrays, rows * weights)
-        fit, size = yield SolveRequest(solve_balance, (plant, places, arrays, fit.theta, *options))
+        weighted = eqx.tree_at(lambda a: a.weight, arrays, rows * weights)
+        # Bodies at the edge of those that can exist have no logarithm to start from.
+        at = theta if transform.bodies else fit.theta
+        again, its_size = yield SolveRequest(solve_balance, (plant, places, weighted, at, *options))
+        if np.all(np.isfinite(again.theta)):
+            fit, size, arrays = again, its_size, weighted
 
     e, weight = np.asarray(fit.residual).reshape(rows.shape), np.asarray(arrays.weight)
     jacobian = np.asarray(fit.jacobian).reshape(*rows.shape, -1)
