@@ -14,7 +14,7 @@ from jaxid.arms.pseudo_inertia import log_cholesky, of_log_cholesky, pseudo_iner
 from jaxid.cli import main
 from jaxid.estimators import _start
 from jaxid.estimators.common.best_bodies import nearest_bodies
-from jaxid.estimators.common.consistency import need_bodies
+from jaxid.estimators.common.consistency import links_of, need_bodies
 from jaxid.estimators.common.interior import inner_start
 from jaxid.estimators.common.levenberg_marquardt import eliminated
 from jaxid.numerics.lanes import run_alone
@@ -254,6 +254,16 @@ def test_methods_without_bodies_end_at_the_nearest(tmp_path, flat, method, text)
     assert eigenvalues(plain).min() < -0.01
     assert missed(kept, FLAT) < 1.05 * missed(plain, FLAT) < 0.02
     assert any("nearest to the fit" in note for note in kept.estimate.notes)
+
+
+def test_links_of_a_failed_fit_have_no_ratio(tmp_path):
+    (tmp_path / "case.toml").write_text(case(True))
+    machine = jaxid.open_session(tmp_path / "case.toml", wrist_log(0, NOISE, 9)).machine
+    theta = machine.parameters.guess.copy()
+    theta[0] = np.nan
+    ratios = [link["eigenvalue_ratio"] for link in links_of(machine.with_estimate(theta).plant)]
+    assert np.isnan(ratios[0])
+    assert np.all(np.array(ratios[1:]) > 0)
 
 
 def test_nearest_bodies_are_the_least_squares_of_another_solver(tmp_path):

@@ -138,9 +138,14 @@ def linked(estimate: Estimate, session: Session) -> Estimate:
 
 
 def links_of(plant: Plant) -> list[dict[str, object]]:
-    """Return each link's parameters, and the smallest eigenvalue of its pseudo-inertia over the largest."""
+    """Return each link's parameters, and the smallest eigenvalue of its pseudo-inertia over the largest.
+
+    The ratio is NaN if a fit failed and left parameters that are not finite.
+    """
     ten = bodies_of(plant)
-    values = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(ten))))
+    finite = np.all(np.isfinite(ten), axis=1)
+    values = np.full((len(ten), 4), np.nan)
+    values[finite] = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(ten[finite]))))
     return [
         {"mass": b[0], "first_moment": b[1:4], "inertia": b[4:], "eigenvalue_ratio": float(v[0] / v[-1])}
         for b, v in zip(ten.tolist(), values, strict=True)
