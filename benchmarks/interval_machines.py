@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from truth.arm.two_links import TwoLinks, run_sampled
-from truth.arm.two_links_case import plant_lines
+from truth.arm.two_links import run_sampled
+from truth.arm.two_links_case import drawn_links, friction_lines, plant_lines
 from truth.axis.cases import case_text
 from truth.axis.machines import EMPS_LOOP, Setup, emps_like, moves, multisine
 from truth.axis.slow_axis import slow_axis
@@ -172,19 +172,7 @@ def chain(seed: int, loop: str, sensor: str) -> Run:
 def arm(seed: int, loop: str, sensor: str) -> Run:
     """Return case, columns and truth of two links under gravity, along sines of the joints or torques."""
     rng = np.random.default_rng([4, seed])
-    draw = lambda *values: [float(v * rng.uniform(0.85, 1.15)) for v in values]
-    names = ("m1", "m2", "x1", "x2", "y2", "i1", "i2")
-    links = TwoLinks(
-        **dict(zip(names, draw(3.0, 2.0, 0.2, 0.25, 0.03, 0.06, 0.05), strict=True)),
-        viscous=tuple(draw(1.5, 0.8)),
-        coulomb=tuple(draw(2.0, 1.2)),
-    )
-    true = {n: float(v) for n, v in links.base.items() if n != "first_moment_y[1]"}
-    # The case states the mass of link 2: what it adds to link 1 is no unknown.
-    true["first_moment_x[1]"] = links.m1 * links.x1
-    true["inertia_zz[1]"] = links.i1 + links.m1 * links.x1**2
-    true |= {f"viscous_friction[{k}].coefficient": v for k, v in enumerate(links.viscous, start=1)}
-    true |= {f"coulomb_friction[{k}].level": v for k, v in enumerate(links.coulomb, start=1)}
+    links, true = drawn_links(rng)
 
     t = np.arange(SAMPLES) / 1000.0
     sines = [0.8, 1.7, 2.9]
@@ -206,9 +194,7 @@ def arm(seed: int, loop: str, sensor: str) -> Run:
     off = dict(zip(true, (1.5 ** rng.choice([-1.0, 1.0], len(true))).tolist(), strict=True))
     entry = lambda name: f"{{ guess = {true[name] * off[name]!r}, true = {true[name]!r} }}"
     lines = plant_lines(links, entry)
-    for kind, key in (("viscous_friction", "coefficient"), ("coulomb_friction", "level")):
-        row = ", ".join(entry(f"{kind}[{k}].{key}") for k in (1, 2))
-        lines += ["[[effects]]", f'kind = "{kind}"', f"{key} = [{row}]"]
+    lines += friction_lines(entry)
     lines += _log_lines(("q1", "q2"), ("u1", "u2"), loop, ("r1", "r2"))
     lines += _law_lines("pd", law) if loop == "known" else []
     lines += _sensor_lines(read) if sensor == "stated" else []

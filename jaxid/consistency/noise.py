@@ -27,9 +27,10 @@ _SAMPLES_EACH = 40
 _NO_MORE = 1.1
 # Rows before the same one that may explain more: the loop of a log's rate differentiates over them.
 _PAST = 2
-# The whole band is more than the first factor times the remainder, and the rows before explain less than the
-# second part of what is explained (in squares). The filter of a loop of the log's rate may hide half of its
-# answer to these rows; a force that plainly does not act for a row is not of such a loop.
+# The whole band is more than the first factor times that remainder, and these rows explain less than the
+# second part of all that is explained (in squares). A loop of the log's rate with a filtered derivative comes
+# near both limits. They are wider for a force that plainly does not act for a row: no loop of that rate makes
+# it.
 _SOME, _OTHER_ROWS = 1.2, 0.06
 _SOME_AT_LEAST, _OTHER_ROWS_AT_MOST = 1.05, 0.2
 # Part of the band of inverse dynamics in which its residual bounds the noise of the force.
@@ -95,8 +96,8 @@ def estimated_force_noise(
     """
     high, in_band = _beyond_controller(machine, log, fast=fast), _in_band(machine, log, data, fit)
     # The high band has more frequencies than the band of a balance, and so the better estimate of one noise.
-    alike = high.faster & (high.noise < _ALIKE * in_band)
-    in_band = np.where(alike, np.maximum(in_band, high.noise), in_band)
+    alike = high.noise < _ALIKE * in_band
+    in_band = np.where(high.faster & alike, np.maximum(in_band, high.noise), in_band)
     bounds = [high.noise, in_band, signals.noise_within_stretches(log.force)]
     if law is not None:
         bounds.append(signals.high_band_std(log.force - law))
@@ -107,7 +108,7 @@ def estimated_force_noise(
     steps = np.array([_step(u) for u in log.force.T])
     return ForceNoise(
         std=np.maximum(noise, steps / np.sqrt(12)),
-        faster_loop=bool(high.faster.any()),
+        faster_loop=high.faster,
         answer=high.answer if high.answer.any() else None,
     )
 
@@ -126,21 +127,22 @@ def loop_is_faster(machine: Machine, log: Log, *, likely: bool = False) -> bool:
         log: The log.
         likely: Whether the force plainly does not act for a row of the log.
     """
-    return bool(np.any(_beyond_controller(machine, log, likely=likely).faster))
+    return _beyond_controller(machine, log, likely=likely).faster
 
 
 class _HighBand(NamedTuple):
-    """High band of each force, (m,) each.
+    """High bands of the forces.
 
     Args:
-        noise: Its standard deviation that counts as noise.
+        noise: Standard deviation of each that counts as noise, (m,).
+        answer: Answer of each force to the noise of its row's reading, (m,); zero where the loop is not
+            faster than the log, or none of the bands shows it.
         faster: Whether the loop is faster than the log.
-        answer: Answer of the force to the noise of its row, where the band shows it; else zero.
     """
 
     noise: np.ndarray
-    faster: np.ndarray
     answer: np.ndarray
+    faster: bool
 
 
 def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False, likely: bool = False) -> _HighBand:
@@ -162,8 +164,8 @@ def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False, likely
     faster = fast or shown
     return _HighBand(
         noise=np.array([found.total if faster else found.left for found in each]),
-        faster=np.full(len(each), faster),
         answer=np.array([found.factor if shown else 0.0 for found in each]),
+        faster=faster,
     )
 
 

@@ -108,7 +108,8 @@ def inverse_dynamics_steps(
         # Bodies at the edge of those that can exist have no logarithm to start from.
         at = theta if transform.bodies else fit.theta
         again, its_size = yield SolveRequest(solve_balance, (plant, places, weighted, at, *options))
-        if np.all(np.isfinite(again.theta)):
+        sound = np.all(np.isfinite(again.theta)) and np.isfinite(float(again.cost))
+        if sound and (bool(again.converged) or not bool(fit.converged)):
             fit, size, arrays = again, its_size, weighted
 
     e, weight = np.asarray(fit.residual).reshape(rows.shape), np.asarray(arrays.weight)

@@ -117,6 +117,19 @@ def test_rows_count_over_the_noise_of_their_joint(monkeypatch, tmp_path):
     assert left[0] / left[1] == pytest.approx(100, rel=0.2), "the residual is the force, without weights"
 
 
+def test_a_weighted_fit_that_fails_leaves_the_first_one(log, monkeypatch, tmp_path):
+    (tmp_path / "case.toml").write_text(text())
+    session = open_session(tmp_path / "case.toml", log)
+    fit = lambda: inverse_dynamics(session.machine, session.fit.data)
+    monkeypatch.setattr("jaxid.estimators.inverse_dynamics.joint_weights", lambda *_: None)
+    plain = fit()
+    monkeypatch.setattr("jaxid.estimators.inverse_dynamics.joint_weights", lambda *_: np.array([np.nan, 1.0]))
+    kept = fit()
+    np.testing.assert_array_equal(kept.theta, plain.theta)
+    np.testing.assert_array_equal(kept.std, plain.std)
+    assert kept.converged
+
+
 RATIO = np.array([[20.0, 0.0], [30.0, -30.0]])
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from truth.arm.two_links import TwoLinks, run_sampled
-from truth.arm.two_links_case import plant_lines
+from truth.arm.two_links import run_sampled
+from truth.arm.two_links_case import drawn_links, friction_lines, plant_lines
 from truth.axis.machines import multisine
 
 RATE = 1000.0
@@ -26,19 +26,7 @@ def slow_arm(
         noise: Number that the noise is drawn with; None: the seed.
     """
     random = np.random.default_rng([44, seed])
-    draw = lambda *values: [float(v * random.uniform(0.85, 1.15)) for v in values]
-    names = ("m1", "m2", "x1", "x2", "y2", "i1", "i2")
-    links = TwoLinks(
-        **dict(zip(names, draw(3.0, 2.0, 0.2, 0.25, 0.03, 0.06, 0.05), strict=True)),
-        viscous=tuple(draw(1.5, 0.8)),
-        coulomb=tuple(draw(2.0, 1.2)),
-    )
-    true = {name: float(v) for name, v in links.base.items() if name != "first_moment_y[1]"}
-    # The case states the mass of link 2: what it adds to link 1 is no unknown.
-    true["first_moment_x[1]"] = links.m1 * links.x1
-    true["inertia_zz[1]"] = links.i1 + links.m1 * links.x1**2
-    true |= {f"viscous_friction[{k}].coefficient": v for k, v in enumerate(links.viscous, start=1)}
-    true |= {f"coulomb_friction[{k}].level": v for k, v in enumerate(links.coulomb, start=1)}
+    links, true = drawn_links(random)
 
     times = np.arange(round(12.0 * RATE)) / RATE
     reference = np.stack([multisine(times, list(_TONES), 1.2, 2 * seed + k) for k in range(2)], axis=1)
@@ -58,9 +46,7 @@ def slow_arm(
     off = dict(zip(true, (1.5 ** random.choice([-1.0, 1.0], len(true))).tolist(), strict=True))
     guess = lambda name: f"{{ guess = {true[name] * off[name]!r} }}"
     lines = plant_lines(links, guess)
-    for kind, key in (("viscous_friction", "coefficient"), ("coulomb_friction", "level")):
-        row = ", ".join(guess(f"{kind}[{k}].{key}") for k in (1, 2))
-        lines += ["[[effects]]", f'kind = "{kind}"', f"{key} = [{row}]"]
+    lines += friction_lines(guess)
     lines += ["[log]", 'time = "t"', 'position = ["q1", "q2"]', 'force = ["u1", "u2"]']
     every = round(RATE / log_rate)
     return "\n".join(lines) + "\n", {name: x[::every] for name, x in run.items()}, true

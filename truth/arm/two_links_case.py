@@ -61,6 +61,33 @@ substeps = 1
 """
 
 
+def drawn_links(random: np.random.Generator) -> tuple[TwoLinks, dict[str, float]]:
+    """Draw two links with friction, and return them with their true values by the names of results."""
+    draw = lambda *values: [float(v * random.uniform(0.85, 1.15)) for v in values]
+    names = ("m1", "m2", "x1", "x2", "y2", "i1", "i2")
+    links = TwoLinks(
+        **dict(zip(names, draw(3.0, 2.0, 0.2, 0.25, 0.03, 0.06, 0.05), strict=True)),
+        viscous=tuple(draw(1.5, 0.8)),
+        coulomb=tuple(draw(2.0, 1.2)),
+    )
+    true = {name: float(v) for name, v in links.base.items() if name != "first_moment_y[1]"}
+    # The case states the mass of link 2: what it adds to link 1 is no unknown.
+    true["first_moment_x[1]"] = links.m1 * links.x1
+    true["inertia_zz[1]"] = links.i1 + links.m1 * links.x1**2
+    true |= {f"viscous_friction[{k}].coefficient": v for k, v in enumerate(links.viscous, start=1)}
+    true |= {f"coulomb_friction[{k}].level": v for k, v in enumerate(links.coulomb, start=1)}
+    return links, true
+
+
+def friction_lines(entry: Callable[[str], str]) -> list[str]:
+    """Return the tables of viscous and Coulomb friction of both joints; `entry` gives an unknown."""
+    lines = []
+    for kind, key in (("viscous_friction", "coefficient"), ("coulomb_friction", "level")):
+        row = ", ".join(entry(f"{kind}[{k}].{key}") for k in (1, 2))
+        lines += ["[[effects]]", f'kind = "{kind}"', f"{key} = [{row}]"]
+    return lines
+
+
 def plant_lines(links: TwoLinks, entry: Callable[[str], str]) -> list[str]:
     """Return the table [plant] of two links under gravity; `entry` gives an unknown by its name."""
     lines = ["[plant]", 'kind = "serial_arm"', "gravity_vector = [0.0, -9.81, 0.0]"]
