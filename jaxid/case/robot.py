@@ -39,6 +39,7 @@ class RobotJoint:
         friction: Level of its dry friction [N m or N].
         spring: Factors of 1, q, q^2 and q^3 in the force against a displacement to the coordinate q.
         range: Lowest and highest coordinate, if it is limited.
+        effort: Largest force of its drive by a URDF's <limit>; None: not stated.
     """
 
     name: str
@@ -52,6 +53,7 @@ class RobotJoint:
     friction: float = 0.0
     spring: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     range: tuple[float, float] | None = None
+    effort: float | None = None
 
 
 @dataclass(frozen=True)

@@ -135,8 +135,7 @@ def init(
     names = () if robot is None else _joints_of(robot, urdf, tip)
     chosen = choose(columns_of(raw.data, raw.units, raw.contents.time, names), raw.source)
     if robot is not None:
-        actuated = {drive.joint for drive in robot.drives}
-        chosen = of_robot(chosen, names, actuated, robot.file, raw.source, to_tip=tip is not None)
+        chosen = of_robot(chosen, names, _actuated(robot), robot.file, raw.source, to_tip=tip is not None)
     elif len(chosen.joints) > 1:
         need_forces(chosen, raw.source)
         chosen = most_moved(chosen)
@@ -182,6 +181,12 @@ def _joints_of(robot: Robot, urdf: str | Path | None, tip: str | None) -> tuple[
         return names
     to_tip = read_urdf(urdf, tip).names
     return tuple(name for name in names if name in to_tip)
+
+
+def _actuated(robot: Robot) -> tuple[str, ...]:
+    """Return the names of the joints that a file's actuators drive, or else those with a limit of effort."""
+    driven = tuple(drive.joint for drive in robot.drives)
+    return driven or tuple(joint.name for joint in robot.free if joint.effort)
 
 
 def _motion_of(robot: Robot, name: str) -> str:

@@ -123,7 +123,34 @@ def columns_of(
         rows = np.arange(flat.size)
         filled = flat if known.all() else np.interp(rows, rows[known], flat[known])
         out.append(Column(meaning, filled, unit))
-    return out
+    return _with_joints_by_symbol([_as_acceleration(column, out) for column in out])
+
+
+def _as_acceleration(column: Column, columns: Sequence[Column]) -> Column:
+    """Return a column called alpha as an acceleration, if the velocity stands beside it and not its own.
+
+    Beside theta it is the second angle of a pendulum.
+    """
+    meaning = column.meaning
+    if meaning.symbol != "alpha" or meaning.quantity != "position":
+        return column
+    rates = [c.meaning.symbol for c in columns if c.meaning.quantity == "velocity"]
+    if not rates or "alpha" in rates:
+        return column
+    return replace(column, meaning=replace(meaning, quantity="acceleration"))
+
+
+def _with_joints_by_symbol(columns: list[Column]) -> list[Column]:
+    """Return columns whose joints are named by the symbols of coordinates, where several positions have one."""
+
+    def named(column: Column) -> bool:
+        return bool(column.meaning.symbol and not column.meaning.joint)
+
+    symbols = {c.meaning.symbol for c in columns if named(c) and c.meaning.quantity == "position"}
+    if len(symbols) < 2:
+        return columns
+    by_symbol = lambda c: replace(c, meaning=replace(c.meaning, joint=(c.meaning.symbol,)))
+    return [by_symbol(c) if named(c) else c for c in columns]
 
 
 def _of_motion(unit: str) -> str:

@@ -90,6 +90,8 @@ class Draft:
 
         if not chosen.force and not (chosen.reference and set(names) <= servos):
             raise lacking_force(chosen, self._raw.source)
+        if chosen.driven is not None and not robot.drives:
+            plant.keys["actuated"] = [names[k] for k in chosen.driven]
         plant.keys["unknown"] = [*unknown]
         plant.notes["unknown"] = "the values of the file that are unknown, from the file's on"
         if measures.labels:

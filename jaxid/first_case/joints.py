@@ -55,11 +55,14 @@ def of_robot(
 def _with_forces_of_driven(chosen: Chosen, actuated: Collection[str], file: str) -> Chosen:
     """Return the columns with the forces of the joints that actuators drive, if the others have none.
 
-    They belong to the joints by their names, or in their order if there are as many.
+    They belong to the joints by their names, or in their order if there are as many. A single force is that
+    of the first joint where the file does not say which joints are driven, as of a pendulum on a cart.
     """
     driven = tuple(k for k, name in enumerate(chosen.joints) if name in actuated)
     loose = chosen.loose_forces
-    if not loose or not driven or len(driven) == len(chosen.joints):
+    if loose and len(driven) in (0, len(chosen.joints)):
+        return _with_force_of_first(chosen, file)
+    if not loose:
         return chosen
     keys = [{chosen.joints[k], " ".join(meaning_of(chosen.joints[k]).joint)} for k in driven]
     named = [[c for c in loose if " ".join(c.meaning.joint) in key] for key in keys]
@@ -71,9 +74,26 @@ def _with_forces_of_driven(chosen: Chosen, actuated: Collection[str], file: str)
         return chosen
     joints = ", ".join(chosen.joints[k] for k in driven)
     columns = ", ".join(f"'{c.name}'" for c in force)
-    said = f"only {joints} of {Path(file).name} {'has' if len(driven) == 1 else 'have'} an actuator"
+    said = f"only {joints} of {Path(file).name} {'is' if len(driven) == 1 else 'are'} driven"
     said += f": {columns} {'is its force' if len(driven) == 1 else 'are their forces'}"
     return replace(chosen, force=force, driven=driven, said=(*chosen.said, said))
+
+
+def _with_force_of_first(chosen: Chosen, file: str) -> Chosen:
+    """Return the columns with a single force as that of the first joint, or of the one that it names."""
+    if len(chosen.loose_forces) != 1:
+        return chosen
+    force, joints = chosen.loose_forces[0], chosen.joints
+    word = " ".join(force.meaning.joint)
+    keys = [{joint, " ".join(meaning_of(joint).joint)} for joint in joints]
+    place = next((k for k, key in enumerate(keys) if word and word in key), 0)
+    said = f"{Path(file).name} does not say which joints are driven: '{force.name}' is taken for the force of "
+    said += f"{joints[place]}, and no other joint has one"
+    question = f'which joint does {force.name} drive? Name it in actuated, as actuated = ["{joints[place]}"]'
+    questions = {**chosen.questions, "actuated": question}
+    return replace(
+        chosen, force=(force,), driven=(place,), said=(*chosen.said, said), questions=questions
+    )
 
 
 def _of_joints(
@@ -100,12 +120,18 @@ def _of_joints(
         at = list(range(len(names)))
         said = f"columns belong to the joints {', '.join(names)} of {Path(file).name} in this order"
     else:
-        listed = ", ".join(f"'{j}'" for j in chosen.joints)
-        hint = "rename the columns by the joints, or the joints by joints = [...] in a case"
+        listed = ", ".join(f"'{c.name}'" for c in chosen.position or chosen.velocity)
+        quantity = "position" if chosen.position else "velocity"
+        columns = ", ".join(f"{name}_{quantity}" for name in names)
+        hint = f"rename the columns by the joints, as {columns}"
         if file.endswith(".urdf"):
-            hint = "name the tip whose joints the log has by --tip, or rename the columns"
+            hint = f"name the tip whose joints the log has by --tip, or {hint}"
+        count = len(chosen.joints)
         raise InputError(
-            f"columns of {listed}, and {Path(file).name} moves {', '.join(names)}", where=where, hint=hint
+            f"{count} column{'s say' if count > 1 else ' says'} the {quantity} of a joint ({listed}), and "
+            f"{Path(file).name} moves {', '.join(names)}",
+            where=where,
+            hint=hint,
         )
 
     def picked(columns: tuple[Column, ...]) -> tuple[Column, ...]:

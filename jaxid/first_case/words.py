@@ -13,15 +13,14 @@ from jaxid.logs.unit_endings import UNITS, unit_ending
 _QUANTITIES: dict[str, str] = {
     "time": "t time zeit zeitstempel timestamp timestamps stamp elapsed uhrzeit datum datetime epoch clock "
     "laufzeit zeitpunkt millis micros seconds",
-    "position": "q p pos position positions lage stellung weg winkel drehwinkel angle theta phi x y z s hub "
+    "position": "q p pos position positions lage stellung weg winkel drehwinkel angle angles ang s hub "
     "displacement encoder enc counts count inkremente increments ticks hoehe height distance dof pose",
-    "velocity": "dq qd v vel velocity velocities speed geschwindigkeit drehzahl omega rpm qdot dtheta "
-    "thetadot w dx xdot",
-    "acceleration": "ddq qdd a acc accel acceleration beschleunigung qddot ddtheta alpha ddx",
+    "velocity": "qd v vel velocity velocities speed geschwindigkeit drehzahl omega rpm w",
+    "acceleration": "qdd a acc accel acceleration beschleunigung vdot wdot omegadot",
     "torque": "tau torque torques trq moment drehmoment effort efforts tq mz",
     "force": "force forces kraft thrust schub f",
-    "current": "current currents curr strom motorstrom i iq amps amp ampere",
-    "voltage": "voltage volt volts spannung uq motorspannung",
+    "current": "current currents curr strom motorstrom i ia iq amps amp ampere",
+    "voltage": "voltage volt volts spannung ua uq va vm motorspannung",
     "duty": "pwm duty dutycycle aussteuerung",
     "load": "load last",
     "command": "u input stellgroesse stellwert control ctrl",
@@ -39,8 +38,15 @@ _ROLES = {
 # Words that say nothing of a joint.
 _NOISE = (
     "joint joints states state js axis achse motor drive antrieb gelenk robot observation msg data est "
-    "estimated of the im am an der die das on at signal channel kanal ch filtered raw n no nr m g l"
+    "estimated of the im am an der die das on at signal channel kanal ch filtered raw n no nr m g l angular "
+    "linear"
 )
+# Symbols of coordinates, which name the joint where a log has several; their derivatives are dx and xdot.
+_SYMBOLS = frozenset("x y z th theta phi psi alpha beta gamma roll pitch yaw".split())
+_TURNS = _SYMBOLS - {*"xyz"}
+# Words for a derivative by time, in a word of their own.
+_DOTS = {"dot": 1, "punkt": 1, "ddot": 2, "dotdot": 2}
+_MOTION = ("position", "velocity", "acceleration")
 # Single letters whose case matters.
 _LETTERS = {
     "V": "voltage",
@@ -52,12 +58,18 @@ _LETTERS = {
 }
 # Quantities that a letter and one more letter stand for, as qm or qg.
 _OF_Q = re.compile(r"q[a-z]")
-ROTARY = frozenset("winkel drehwinkel angle theta phi drehzahl omega rpm dtheta thetadot dof tau".split())
+ROTARY = _TURNS | frozenset("winkel drehwinkel angle angles ang drehzahl omega rpm dof tau".split())
 LINEAR = frozenset("weg hub displacement hoehe height distance".split())
 # Units with a capital, which begins no word.
 _PREFIXED = ("mNm", "mA", "mV", "kN")
 FORCES = ("torque", "force", "current", "voltage", "duty", "command", "load")
 _MEANING = {word: quantity for quantity, words in _QUANTITIES.items() for word in words.split()}
+# Words that hold the symbol of a coordinate, by symbol and number of derivatives.
+_DERIVATIVES = {
+    pattern.format(symbol): (symbol, order)
+    for symbol in (*_SYMBOLS, "q")
+    for pattern, order in (("d{}", 1), ("{}dot", 1), ("dd{}", 2), ("{}ddot", 2))
+}
 _ROLE = {word: role for role, words in _ROLES.items() for word in words.split()}
 _SILENT = frozenset(_NOISE.split())
 # Words long enough to be parts of others, as in Lageistwert or TorqueActualValue, longest first.
@@ -75,6 +87,7 @@ class Meaning:
             over"; empty: the name says nothing.
         reference: Whether it is a wanted value.
         joint: Words that are left, which name the joint; empty if there are none.
+        symbol: Symbol of a coordinate in the name, as theta in theta_dot; empty if there is none.
         unit: Unit that the name ends in; empty if it has none.
         words: All words of the name.
     """
@@ -85,6 +98,7 @@ class Meaning:
     joint: tuple[str, ...]
     unit: str
     words: frozenset[str]
+    symbol: str = ""
 
     @property
     def motion(self) -> str:
@@ -111,26 +125,80 @@ def meaning_of(name: str) -> Meaning:
     if len(parts) == 1 and parts[0] in ("ms", "us", "ns"):
         return Meaning(name, "time", False, (), parts[0], frozenset(parts))
 
-    quantities, roles, joint, words = [], [], [], []
-    for part in parts:
-        found = [_LETTERS[part]] if part in _LETTERS else []
-        pieces = [] if found else _pieces(part.casefold())
-        if not found and pieces is None:
-            if _OF_Q.fullmatch(part.casefold()):
-                found = ["position"]
-            else:
-                joint.append(part.casefold())
-                continue
-        words += [part.casefold()] if found else pieces or []
-        quantities += found
-        for piece in pieces or []:
-            if piece in _ROLE:
-                roles.append(_ROLE[piece])
-            elif piece in _MEANING:
-                quantities.append(_MEANING[piece])
-    quantity = _one(quantities)
-    reference = "reference" in roles and "actual" not in roles
-    return Meaning(name, quantity, reference, tuple(joint), unit, frozenset(words))
+    found = _Words()
+    for k, part in enumerate(parts):
+        found.add(part, first=k == 0)
+    return found.meaning(name, unit)
+
+
+class _Words:
+    """The words of a name, sorted as they are added."""
+
+    def __init__(self) -> None:
+        self.quantities: list[str] = []
+        self.roles: list[str] = []
+        self.joint: list[str] = []
+        self.words: list[str] = []
+        self.symbol = ""
+        self.derivatives = 0
+
+    def add(self, part: str, *, first: bool) -> None:
+        """Add one part of the name."""
+        word = part.casefold()
+        moved = bool({*self._said()} & {*_MOTION})
+        if word == "d" and not first and moved:
+            self.roles.append("reference")  # theta_d is the desired angle
+        elif (word == "d" and first) or (word == "dd" and (first or moved)):
+            self.derivatives += len(word)
+        elif word in _DOTS:
+            self.derivatives += _DOTS[word]
+        elif word in _DERIVATIVES:
+            symbol, order = _DERIVATIVES[word]
+            self.derivatives += order
+            self.add(symbol, first=False)
+        elif word in _SYMBOLS:
+            self.symbol = self.symbol or word
+            self.words.append(word)
+        elif part in _LETTERS:
+            self.quantities.append(_LETTERS[part])
+            self.words.append(word)
+        elif word == "a" and self.quantities:
+            self.words.append(word)  # of the armature, as in i_a
+        else:
+            self._add_pieces(word)
+
+    def _add_pieces(self, word: str) -> None:
+        pieces = _pieces(word)
+        if pieces is None and _OF_Q.fullmatch(word):
+            self.quantities.append("position")
+            self.words.append(word)
+        elif pieces is None:
+            self.joint.append(word)
+        else:
+            self.words += pieces
+            self.roles += [_ROLE[p] for p in pieces if p in _ROLE]
+            self.quantities += [_MEANING[p] for p in pieces if p in _MEANING and p not in _ROLE]
+
+    def _said(self) -> list[str]:
+        """Return the quantities; a symbol alone is a position."""
+        return self.quantities or (["position"] if self.symbol else [])
+
+    def meaning(self, name: str, unit: str) -> Meaning:
+        """Return the meaning of the name, which ends in this unit."""
+        quantities, joint = self._said(), list(self.joint)
+        moved = [q for q in quantities if q in _MOTION]
+        if moved and "load" in quantities:
+            # The position of a load is no load.
+            quantities, joint = moved, [*joint, "load"]
+        return Meaning(
+            name=name,
+            quantity=_derived(_one(quantities), self.derivatives),
+            reference="reference" in self.roles and "actual" not in self.roles,
+            joint=tuple(joint),
+            unit=unit,
+            words=frozenset(self.words),
+            symbol=self.symbol,
+        )
 
 
 def meaning_of_joint(name: str, joints: Sequence[str]) -> Meaning:
@@ -161,7 +229,7 @@ def _one(found: list[str]) -> str:
     """Return the quantity of a name with several words for one."""
     if "passed over" in found:
         return "passed over"
-    moved = [q for q in found if q in ("position", "velocity", "acceleration")]
+    moved = [q for q in found if q in _MOTION]
     if moved and "current" in found:
         # Of "current position" the first word is an adjective.
         return moved[-1]
@@ -171,6 +239,14 @@ def _one(found: list[str]) -> str:
     if forces:
         return forces[0]
     return moved[-1] if moved else found[0] if found else ""
+
+
+def _derived(quantity: str, order: int) -> str:
+    """Return the derivative of a quantity by time; empty if it is none of a motion."""
+    if order == 0:
+        return quantity
+    place = _MOTION.index(quantity) + order if quantity in _MOTION else len(_MOTION)
+    return _MOTION[place] if place < len(_MOTION) else ""
 
 
 def _unit_at_end(name: str) -> tuple[str, str]:
