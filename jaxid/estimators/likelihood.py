@@ -46,7 +46,7 @@ _BEGINS = 4
 _FINER = 4
 # Factor on the steps that the fastest rate needs, in the last fit: the error of a joint that comes to rest
 # behind a spring within a step grows with the square of that step.
-_FINER_BY_RATE = 16.0
+_FINER_BY_RATE = 40.0
 
 
 @dataclass(frozen=True)
