@@ -127,7 +127,7 @@ def columns_of(
 
 
 def _as_acceleration(column: Column, columns: Sequence[Column]) -> Column:
-    """Return a column called alpha as an acceleration, if the velocity stands beside it and not its own.
+    """Return a column called alpha as an acceleration, if a velocity stands beside it and not alpha_dot.
 
     Beside theta it is the second angle of a pendulum.
     """
@@ -141,7 +141,7 @@ def _as_acceleration(column: Column, columns: Sequence[Column]) -> Column:
 
 
 def _with_joints_by_symbol(columns: list[Column]) -> list[Column]:
-    """Return columns whose joints are named by the symbols of coordinates, where several positions have one."""
+    """Return columns with the symbols of coordinates as names of joints, where several positions have one."""
 
     def named(column: Column) -> bool:
         return bool(column.meaning.symbol and not column.meaning.joint)

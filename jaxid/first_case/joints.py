@@ -87,13 +87,12 @@ def _with_force_of_first(chosen: Chosen, file: str) -> Chosen:
     word = " ".join(force.meaning.joint)
     keys = [{joint, " ".join(meaning_of(joint).joint)} for joint in joints]
     place = next((k for k, key in enumerate(keys) if word and word in key), 0)
-    said = f"{Path(file).name} does not say which joints are driven: '{force.name}' is taken for the force of "
-    said += f"{joints[place]}, and no other joint has one"
-    question = f'which joint does {force.name} drive? Name it in actuated, as actuated = ["{joints[place]}"]'
+    joint = joints[place]
+    said = f"{Path(file).name} does not say which joints are driven: '{force.name}' is taken for the force "
+    said += f"of {joint}, and no other joint has one"
+    question = f'which joint does {force.name} drive? Name it in actuated, as actuated = ["{joint}"]'
     questions = {**chosen.questions, "actuated": question}
-    return replace(
-        chosen, force=(force,), driven=(place,), said=(*chosen.said, said), questions=questions
-    )
+    return replace(chosen, force=(force,), driven=(place,), said=(*chosen.said, said), questions=questions)
 
 
 def _of_joints(
