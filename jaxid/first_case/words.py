@@ -44,7 +44,7 @@ _NOISE = (
 # Symbols of coordinates, which name the joint where a log has several; their derivatives are dx and xdot.
 _SYMBOLS = frozenset("x y z th theta phi psi alpha beta gamma roll pitch yaw".split())
 _TURNS = _SYMBOLS - {*"xyz"}
-# Words for a derivative by time, in a word of their own.
+# Separate words for derivatives by time.
 _DOTS = {"dot": 1, "punkt": 1, "ddot": 2, "dotdot": 2}
 _MOTION = ("position", "velocity", "acceleration")
 # Single letters whose case matters.
