@@ -39,6 +39,11 @@ _DRAWN = 1e-3
 # value without an effect.
 _NOTHING = 0.1
 
+# A ripple of which the filter passes less than this part of the power, at the speeds that count, is an
+# extrapolation from a few samples near reversals, where friction that is no step leaves its error too.
+_IN_BAND = 0.03
+_ENDLESS = 1e12
+
 # A load behind a spring is a part of the joint's inertia; one that is so many times as large is none.
 _HEAVIER = 1.25
 
@@ -244,6 +249,9 @@ class Acceptance:
         if heavier:
             return f"{heavier} would be more than the inertia of the joint, of which it is a part"
 
+        if self._beyond_band(index, new):
+            return "its ripple is beyond the band of the filter at nearly all speeds of the log"
+
         e = self.residual(new)
         if self._sum(e) < self._least(fitted) * self._sure_noise.sum():
             return "it removes more than the sensors' noise allows"
@@ -285,6 +293,20 @@ class Acceptance:
             if new[i] > _HEAVIER * inertia_at(plant, int(plant.effects[f.effect].port)):
                 return f.name
         return ""
+
+    def _beyond_band(self, index: np.ndarray, new: np.ndarray) -> bool:
+        """Check for an added ripple over the position that the filter removes nearly everywhere."""
+        free = self.superset.machine.parameters.free
+        added = {free[i].path[-1]: i for i in index if free[i].effect is not None}
+        if not {"amplitude", "period", "phase"} <= {*added}:
+            return False
+        # A period of no end makes a constant force of the ripple, which passes the filter.
+        without, constant = new.copy(), new.copy()
+        without[added["amplitude"]] = 0.0
+        constant[added["period"]], constant[added["phase"]] = _ENDLESS, 0.0
+        nothing = self.residual(without)
+        passed, whole = (self._sum(nothing - self.residual(x)) for x in (new, constant))
+        return bool(2 * passed < _IN_BAND * whole)
 
     def _least(self, fitted: int) -> float:
         """Return the part of the noise's sum of squares that a fit of so many unknowns must leave.

@@ -123,9 +123,12 @@ class Plant(PlantInterface):
 
 
 def inertia_at(plant: Plant, joint: int) -> float:
-    """Return the inertia of a joint, its added masses included; infinite if it varies with the position."""
+    """Return the inertia of a joint, its added masses included.
+
+    It is infinite if it varies with the position, or if the joint is a body that another one carries along.
+    """
     constant = plant.own_inertia()
-    if constant is None:
+    if constant is None or joint >= np.size(constant):
         return np.inf
     added = [
         float(np.sum(np.asarray(getattr(e, name))))

@@ -3,6 +3,7 @@
 import dataclasses
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,7 +19,9 @@ from jaxid.discovery.where import _bin_offset, _in_words, _loud
 from jaxid.effects.actuator import Saturation
 from jaxid.gap import noise_density
 from jaxid.model.effect import Scales
+from jaxid.model.plant import inertia_at
 from jaxid.numerics.coloured_noise import NoiseModel
+from jaxid.plants.micropositioning_stage import RigidMicropositioningStage
 from jaxid.session import open_session
 from jaxid.simulation.force_balance import ForceData, force_residual
 from tests.support.axis_log import log_of
@@ -236,6 +239,28 @@ def test_a_load_heavier_than_its_joint_is_turned_down(axis):
 
     assert objection(2.0).startswith("joint_flexibility.load_inertia would be more than the inertia")
     assert "more than the inertia" not in objection(0.5)
+
+
+def test_a_ripple_beyond_the_band_of_the_filter_is_turned_down(axis):
+    _, search = axis
+    index = next(c for c in search.superset.candidates if c.kind == "cogging").index
+    data = search.acceptance.data
+    slow = np.quantile(np.abs(data.at_kept(data.qd)[:, 0]), 0.3)
+    band = data.recipe.band_hz(1 / data.period)
+
+    def objection(periods_a_second: float) -> str:
+        """With so many periods in the band's width at a speed that is exceeded in most of the log."""
+        new = with_values(search, "cogging", [2.0, slow / periods_a_second, 0.3])
+        return search.acceptance.objection(np.array(index), search.theta, new, None, None, 5)
+
+    assert objection(5 * band).startswith("its ripple is beyond the band of the filter")
+    assert "ripple" not in objection(0.05 * band)
+
+
+def test_a_body_that_another_carries_along_has_no_separate_inertia():
+    stage = RigidMicropositioningStage(jnp.array(2e-4), jnp.array(3.0), jnp.array(2e-3))
+    assert inertia_at(stage, 0) == pytest.approx(2e-4 + 3.0 * (2e-3 / (2 * np.pi)) ** 2)
+    assert inertia_at(stage, 1) == np.inf
 
 
 def test_a_joint_with_little_noise_counts_for_little():
