@@ -34,6 +34,7 @@ from jaxid.errors import InputError, suggest
 from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.common.consistency import need_bodies, with_links
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
+from jaxid.estimators.common.shapes import without_unseen_shapes
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
@@ -215,7 +216,7 @@ def _explore_forces(
         effects=found.effects,
         rounds=_as_refitted([_round(search, s) for s in steps], before.gaps, new, len(session.fits)),
         before=before.estimate,
-        after=with_effort(estimate, session, new, searched=True),
+        after=with_effort(without_unseen_shapes(estimate), session, new, searched=True),
         gaps_before=before.gaps,
         gaps_after=new,
         noise_floor=search.floor,

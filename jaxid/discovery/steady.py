@@ -22,6 +22,7 @@ from jaxid.discovery.score import Score
 from jaxid.discovery.search import Step
 from jaxid.discovery.selection import simplest_equivalent
 from jaxid.discovery.where import Where
+from jaxid.estimators.common.shapes import without_unseen_shapes
 from jaxid.estimators.estimate import Estimate
 from jaxid.gap import force_gap, gaps, row_noise
 from jaxid.machine import Machine
@@ -111,7 +112,7 @@ def explore_steady(
         effects=tuple(named),
         rounds=tuple(rounds),
         before=before,
-        after=after,
+        after=without_unseen_shapes(after),
         gaps_before=old,
         gaps_after=new,
         noise_floor=floor,

@@ -56,6 +56,19 @@ def test_the_strength_is_not_identifiable_without_the_shape(estimate):
     assert found.notes[-1].startswith("stribeck_friction.level: not identifiable without the shape")
 
 
+@pytest.mark.parametrize(("ratio", "seen"), [(0.8, True), (1.2, False)])
+def test_the_strength_needs_a_shape_larger_than_its_deviation(estimate, ratio, seen):
+    names = list(estimate.names)
+    velocity = names.index("stribeck_friction.velocity")
+    std = np.full(len(names), 1e-3)
+    std[velocity] = ratio * estimate.theta[velocity]
+    precision = dataclasses.replace(blind(estimate).precision, covariance=np.diag(std**2))
+    found = without_unseen_shapes(dataclasses.replace(estimate, precision=precision))
+    assert dict(zip(names, found.identifiable, strict=True)) == {
+        name: seen or not name.startswith("stribeck") for name in names
+    }
+
+
 @pytest.mark.parametrize("names", [(), ("inertia",), ("stribeck_friction.level",)])
 def test_whatever_has_no_unseen_shape_stays(estimate, names):
     before = blind(estimate, *names)

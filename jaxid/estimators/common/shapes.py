@@ -130,15 +130,26 @@ def without_unseen_shapes(estimate: Estimate) -> Estimate:
     """Return the estimate with the unknowns of an effect not identifiable if its shape is not.
 
     A shape that the log does not show ends anywhere. The standard deviation of the strength then holds for
-    that value of the shape only.
+    that value of the shape only. So it does where the deviation of a positive shape is as large as its value:
+    a strength that is 70 times too small had an interval 40 times too short, at a velocity 30 times too
+    large.
     """
     free, identifiable = estimate.machine.parameters.free, estimate.identifiable
-    if estimate.theta.size == 0 or identifiable.all():
+    shape = shapes(estimate.machine)
+    if not shape.any():
         return estimate
 
-    blind = shapes(estimate.machine) & ~identifiable
-    unseen = {f.effect for f, b in zip(free, blind, strict=True) if b}
-    depends = np.asarray([ok and f.effect in unseen for f, ok in zip(free, identifiable, strict=True)])
+    vague = shape & identifiable & np.asarray([f.sign == "positive" for f in free])
+    vague &= ~(np.nan_to_num(estimate.std) < np.abs(estimate.theta))
+    unseen = {f.effect for f, b in zip(free, vague | (shape & ~identifiable), strict=True) if b}
+    # A shape without a strength, as the time constant of a lag, needs no other value.
+    unseen &= {f.effect for f, s, ok in zip(free, shape, identifiable, strict=True) if ok and not s}
+    depends = np.asarray(
+        [
+            ok and f.effect in unseen and (v or not s)
+            for f, s, v, ok in zip(free, shape, vague, identifiable, strict=True)
+        ]
+    )
     if not depends.any():
         return estimate
 
