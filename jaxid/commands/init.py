@@ -12,20 +12,25 @@ from jaxid.case.case import Case, load_case
 from jaxid.case.mjcf import read_mjcf
 from jaxid.case.robot import Robot
 from jaxid.case.urdf import read_urdf, read_urdf_tree
+from jaxid.consistency.balance_fit import rough_gains
 from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.first_case.columns import Chosen, choose, columns_of
 from jaxid.first_case.drafting import Draft
+from jaxid.first_case.gains import with_gains
 from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_robot
 from jaxid.first_case.raw import raw_log
 from jaxid.first_case.section import Section, case_text
 from jaxid.first_case.units import measures_of
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
+from jaxid.session import open_session
 
 # Values of a robot's file that forces show, and those that a servo's motion along a known reference shows.
 UNKNOWN_OF_FORCES = ("base", "armature", "damping", "frictionloss")
 UNKNOWN_OF_SERVOS = ("damping", "frictionloss", "kp", "kv", "delay", "forcerange")
+# Largest standard deviation of a rough gain, as a part of it, for which it is an unknown of a first case.
+_SHOWN = 0.05
 _TITLE = (
     "Lines that begin with `assumed` say what the log seemed to show.",
     "Lines that begin with `question` ask what only you know. Neither stops a command.",
@@ -146,6 +151,11 @@ def init(
         key = "urdf" if mjcf is None else "mjcf"
         words = (UNKNOWN_OF_FORCES if chosen.force else UNKNOWN_OF_SERVOS) if unknown is None else unknown
         sections = draft.tree(robot, Path(robot.file), key, chosen.joints, words)
+        if unit := draft.unit_of_force:
+            known, *others = draft.driven
+            tried = with_gains(sections, dict.fromkeys(others, 1.0), known, unit)
+            shown = _shown_gains(_first_case(raw.source, Path(folder), tried), log, others)
+            sections = with_gains(sections, shown, known, unit)
     elif not chosen.force:
         sections = draft.without_force()
     else:
@@ -165,6 +175,27 @@ def _first_case(source: str, folder: Path, sections: Sequence[Section]) -> First
         tuple(line for section in sections for line in section.assumed),
         tuple(line for section in sections for line in section.questions),
     )
+
+
+def _shown_gains(first: FirstCase, log: LogLike, joints: Sequence[int]) -> dict[int, float]:
+    """Return the rough gains of the drives of which a log shows the gain, by joint.
+
+    Joints of an arm push each other, which shows the ratios of their gains.
+
+    Args:
+        first: Case in which the gains of these joints are unknown.
+        log: The log.
+        joints: Joints whose gain is unknown, 0-based.
+    """
+    try:
+        session = open_session(first.case(), log)
+    except InputError:
+        return {}  # the command that follows says what is wrong
+    rough = rough_gains(session.machine, session.fit.data)
+    if rough is None:
+        return {}
+    found = zip(joints, rough.gains.tolist(), rough.std.tolist(), strict=True)
+    return {joint: gain for joint, gain, std in found if gain > 0 and std < _SHOWN * gain}
 
 
 def _robot(mjcf: str | Path | None, urdf: str | Path | None) -> Robot | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -21,6 +22,11 @@ from jaxid.simulation.force_balance import ForceData, force_and_columns, measure
 
 # Stroke of a joint that turns [rad] beyond which its weight may act as sine and cosine.
 _SWINGS = 0.3
+# Largest natural logarithm of a rough gain of a drive over its guess: a factor of 20.
+_FAR_GAIN = 3.0
+# Singular value, as a part of the largest, below which a direction of a rough fit is not identifiable, and
+# share of an unknown in it from which it is not either.
+_BLIND, _SHARE = 1e-9, 1e-3
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,99 @@ class BalanceFit:
         )
 
 
+def with_rough_gains(machine: Machine, data: Prepared) -> Machine:
+    """Return a machine with unknown gains of drives at a rough least-squares fit to a log.
+
+    Joints of an arm push each other: if one gain is known, the log shows the others. All unknowns to which
+    forces are in proportion follow, because their guesses may be in another unit than the force. A machine
+    without unknown gains stays as it is, and so does one whose fitted gains are none, or far off.
+
+    Args:
+        machine: The machine.
+        data: The prepared log.
+    """
+    if (rough := rough_gains(machine, data)) is None:
+        return machine
+    guess = np.asarray(machine.parameters.guess, dtype=np.float64)
+    ratio = rough.gains / guess[rough.places]
+    if not np.all(np.isfinite(rough.values)) or np.any(np.abs(np.log(np.maximum(ratio, 1e-300))) > _FAR_GAIN):
+        return machine
+    positive = np.array([f.sign == "positive" for f in machine.parameters.free])
+    values = np.where(positive & (rough.values <= 0), guess, rough.values)
+    return machine.with_estimate(np.clip(values, *machine.parameters.bounds))
+
+
+class RoughGains(NamedTuple):
+    """Rough gains of drives; see `rough_gains`.
+
+    Args:
+        places: Places of the gains among the unknowns, (k,).
+        values: Values of all unknowns; those in proportion to which no force acts are the guesses, (p,).
+        std: Standard deviations of the gains for a white residual, (k,); infinite for one that the log does
+            not show.
+    """
+
+    places: np.ndarray
+    values: np.ndarray
+    std: np.ndarray
+
+    @property
+    def gains(self) -> np.ndarray:
+        """Values of the gains, (k,)."""
+        return self.values[self.places]
+
+
+def rough_gains(machine: Machine, data: Prepared) -> RoughGains | None:
+    """Fit the unknown gains of drives, and the unknowns in proportion to which forces act, to a log.
+
+    Args:
+        machine: The machine.
+        data: The prepared log.
+
+    Returns:
+        The fit; None if no gain is unknown, or all are, so that nothing has a scale.
+    """
+    parameters = machine.parameters
+    gains = np.array([_is_gain(machine.plant, f) for f in parameters.free], dtype=bool)
+    if not gains.any() or gains.sum() >= data.force.shape[1]:
+        return None
+    fitted = gains | np.array([_is_force(machine.plant, f) for f in parameters.free], dtype=bool)
+    plant, arrays = sharpened(machine.plant, data), ForceData.of(data, data.fitted)
+    guess = np.asarray(parameters.guess, dtype=np.float64)
+    e, columns = (np.asarray(x) for x in force_and_columns(plant, parameters.places, arrays, guess))
+
+    # The residual is the model over the gain, minus the declared force: times the gain it is linear.
+    declared, places = np.asarray(measured_force(plant, arrays)), np.flatnonzero(gains)
+    joints = [_joint_of(machine.plant, parameters.free[k]) for k in places]
+    factor = np.ones(e.shape[1])
+    factor[joints] = guess[places]
+    columns = columns * factor[:, None]
+    columns[..., places] = 0.0
+    for joint, place in zip(joints, places, strict=True):
+        columns[:, joint, place] = -declared[:, joint]
+    known = (e + declared) * factor - columns[..., fitted & ~gains] @ guess[fitted & ~gains]
+    free_of_gain = np.setdiff1d(np.arange(len(factor)), joints)
+    known[:, free_of_gain] -= declared[:, free_of_gain]
+    columns = columns[..., fitted]
+
+    size = np.sqrt(np.mean(declared**2, axis=0))
+    size = np.where(size > 0, size, 1.0)
+    rows, target = (columns / size[:, None])[data.fitted], (-known / size)[data.fitted]
+    norm = np.linalg.norm(rows, axis=0)
+    norm = np.where(norm > 0, norm, 1.0)
+    left, strength, right = np.linalg.svd(rows / norm, full_matrices=False)
+    seen = strength > _BLIND * strength[0]
+    solved = right[seen].T @ ((left.T @ target)[seen] / strength[seen])
+    variance = np.mean((rows / norm @ solved - target) ** 2)
+    spread = np.sqrt(variance * np.sum((right[seen].T / strength[seen]) ** 2, axis=1))
+    spread[np.any(np.abs(right[~seen]) > _SHARE, axis=0)] = np.inf
+
+    values = guess.copy()
+    values[fitted] = solved / norm
+    of_gains = gains[fitted]
+    return RoughGains(np.flatnonzero(gains), values, (spread / norm)[of_gains])
+
+
 def balance_fits(
     machine: Machine, data: Prepared, turned: Sequence[Sequence[int]] = ((),)
 ) -> list[BalanceFit]:
@@ -121,10 +220,10 @@ def balance_fits(
         turned: Drives whose force is taken with the opposite sign, 0-based, one list for each result.
     """
     plant, places = sharpened(machine.plant, data), machine.parameters.places
-    theta = machine.parameters.guess
     linear = np.array([_is_force(machine.plant, f) for f in machine.parameters.free], dtype=bool)
     arrays = ForceData.of(data, data.fitted)
     drives = data.force.shape[1]
+    theta = machine.parameters.guess
 
     def evaluate(sign: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         signed = eqx.tree_at(lambda a: a.force, arrays, data.force * sign)
@@ -159,6 +258,18 @@ def balance_fits(
         )
         out.append(replace(base, known=known, columns=columns))
     return out
+
+
+def _is_gain(plant: Plant, free: Free) -> bool:
+    """Check that an unknown is the gain of a drive."""
+    effect = None if free.effect is None else plant.effects[free.effect]
+    return effect is not None and effect.drive_gain is not None and free.path[-1] == effect.drive_gain
+
+
+def _joint_of(plant: Plant, free: Free) -> int:
+    """Return the joint of an unknown of an effect, 0-based."""
+    assert free.effect is not None, "a gain belongs to an effect"
+    return int(plant.effects[free.effect].port)
 
 
 def _is_force(plant: Plant, free: Free) -> bool:

@@ -74,7 +74,7 @@ def better_hold(
 
 def shifts_in_time(machine: Machine, data: Prepared) -> bool:
     """Check whether a drive shifts its force in time, or the filter ignores for how long a force acts."""
-    drives = any(e.delays_command() or not e.adds_force for e in machine.plant.effects)
+    drives = any(e.shifts_time for e in machine.plant.effects)
     return drives or not data.recipe.align_hold
 
 

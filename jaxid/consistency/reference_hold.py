@@ -74,7 +74,7 @@ def compare_reference_holds(
         return None
     if machine.unknown_controller:
         return None
-    if any(e.delays_command() or not e.adds_force for e in machine.plant.effects):
+    if any(e.shifts_time for e in machine.plant.effects):
         return ReferenceHold({}, None, "an effect of the drive changes the force in time")
     laws = {hold: law_at_ticks(replace(machine, reference_hold=hold), log) for hold in HOLDS}
     commands = {hold: law for hold, law in laws.items() if law is not None}

@@ -29,7 +29,7 @@ SEEMS = "the force seems to be logged"
 
 def shifts_force(machine: Machine) -> bool:
     """Check whether the machine has an effect that shifts the force in time by itself."""
-    return any(e.delays_command() or not e.adds_force for e in machine.plant.effects)
+    return any(e.shifts_time for e in machine.plant.effects)
 
 
 def states_delay(table: LogTable | None) -> bool:

@@ -26,8 +26,10 @@ _FOLLOWED = 0.5
 _NEAR_ZERO = 0.05
 # Most columns without a known meaning that are listed.
 _LISTED = 6
-# Order in which forces are chosen, with those that are only commanded after all that are measured.
+# Order in which forces are chosen. A measured current comes before a wanted torque, which a robot's
+# controller may have computed by a model of its own, without friction.
 _RANK = {kind: k for k, kind in enumerate(FORCES)}
+_MEASURED = ("torque", "force", "current")
 
 
 @dataclass(frozen=True)
@@ -354,14 +356,24 @@ def _forces(
         return ({joints[0]: voltages[0]} if voltages else {}), ()
 
     beside = [c for c in usable if not any(c is k for k in chosen.values())]
-    if chosen and beside and len(joints) == 1:
-        listed = ", ".join(f"'{c.name}'" for c in beside)
-        said.append(f"force is '{next(iter(chosen.values())).name}'; {listed} could be it as well")
+    if chosen and beside:
+        said.append(_beside(tuple(chosen.values()), beside))
     return chosen, () if chosen else tuple(usable)
 
 
-def _force_rank(column: Column) -> tuple[int, bool]:
-    return _RANK.get(column.meaning.quantity, len(_RANK)), column.meaning.reference
+def _beside(chosen: Sequence[Column], beside: Sequence[Column]) -> str:
+    """Return the line on forces that a log has beside those that were chosen."""
+    names = [f"'{c.name}'" for c in beside]
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    if len(chosen) == 1:
+        return f"force is '{chosen[0].name}'; {', '.join(names[:_LISTED])}{more} could be it as well"
+    forces = ", ".join(f"'{c.name}'" for c in chosen)
+    return f"forces are {forces}; {', '.join(names[:_LISTED])}{more} could be these as well"
+
+
+def _force_rank(column: Column) -> tuple[bool, int, bool]:
+    kind, wanted = column.meaning.quantity, column.meaning.reference
+    return wanted or kind not in _MEASURED, _RANK.get(kind, len(_RANK)), wanted
 
 
 def _bare_command(column: Column, position: Mapping[str, Column]) -> bool:

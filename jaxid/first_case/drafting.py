@@ -44,6 +44,16 @@ class Draft:
         self._joints = len(chosen.position or chosen.velocity)
         self._motions = (measures.motion,) * self._joints
 
+    @property
+    def unit_of_force(self) -> str:
+        """Unit of the forces where it is none of a torque, as "A"; empty otherwise, or without a force."""
+        return self._measures.labels.get("force", "") if self._chosen.force else ""
+
+    @property
+    def driven(self) -> tuple[int, ...]:
+        """Joints with a drive, 0-based, in the order of the forces."""
+        return tuple(range(self._joints)) if self._chosen.driven is None else self._chosen.driven
+
     # what stands in the case
 
     def axis(self) -> list[Section]:
@@ -374,7 +384,7 @@ class Draft:
             key: list(value.values()) if isinstance(value, dict) and key != "units" else value
             for key, value in table.keys.items()
         }
-        driven = tuple(range(self._joints)) if self._chosen.driven is None else self._chosen.driven
+        driven = self.driven
         frame = Frame(
             motions=self._motions,
             driven=driven,

@@ -223,6 +223,13 @@ class Effect(eqx.Module):
     viscous_coefficient: ClassVar[str | None] = None
     # Factor from the declared force of the drive to the applied one.
     drive_gain: ClassVar[str | None] = None
+
+    @property
+    def shifts_time(self) -> bool:
+        """True if the effect may shift the force of a drive in time."""
+        changes = not self.adds_force and self.drive_gain is None
+        return changes or self.delays_command()
+
     # Whether it puts a part of the inertia behind an additional spring, so that the machine resonates.
     adds_spring: ClassVar[bool] = False
     # Class of the same effect at a joint of a plant without springs; None: there is none.

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxid.build import drives_of_case
 from jaxid.case.case import Case
-from jaxid.consistency.balance_fit import BalanceFit, balance_fits
+from jaxid.consistency.balance_fit import BalanceFit, balance_fits, with_rough_gains
 from jaxid.consistency.clipped import clipped_force
 from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
 from jaxid.consistency.law import law_findings, loop_velocity_findings, replayed_law
@@ -67,6 +67,7 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
     if log.passive:
         # Sign, hold and noise of a force, and a law, need a force.
         return AgainstCase([], None, machine.reference_hold, ForceNoise(np.zeros(log.force.shape[1])), {})
+    machine = with_rough_gains(machine, data)
     declared = balance_fits(machine, data)[0]
     if not declared.finite:
         return AgainstCase([], None, machine.reference_hold, ForceNoise(np.zeros(log.force.shape[1])), {})

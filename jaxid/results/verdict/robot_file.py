@@ -30,8 +30,8 @@ def contradicted_file(session: Session, estimate: Estimate) -> list[str]:
     """
     plant = session.case.tables.get("plant", {})
     file = plant.get("mjcf") or plant.get("urdf")
-    if not file:
-        return []
+    if not file or "force" in plant.get("units", {}):
+        return []  # a file is in kg and N m, and says nothing about values in A
     of_file = {f.name: f.guess for f in session.machine.parameters.free if _from_file(f, session.case)}
     std = estimate.std if estimate.std_misspecified is None else estimate.std_misspecified
     spread = np.fmax(estimate.std, std)
