@@ -190,9 +190,18 @@ def _tree_joint(joint: _Joint, parent: int, place: np.ndarray, file: str) -> Rob
         ends = [0.0 if limit.get(k) is None else _numbers(limit, k, 1, where)[0] for k in ("lower", "upper")]
         if ends[0] < ends[1]:
             known["range"] = (float(ends[0]), float(ends[1]))
-    if limit is not None and limit.get("effort") is not None:
-        known["effort"] = float(_numbers(limit, "effort", 1, where)[0])
+    if limit is not None:
+        known["effort"] = _effort(limit)
     return RobotJoint(joint.name, joint.motion, parent, place, np.zeros(10), **known)
+
+
+def _effort(limit: Element) -> float | None:
+    """Return the largest force of a joint's drive; None if it is no number, which nothing else needs."""
+    try:
+        value = float(limit.get("effort", "nan"))
+    except ValueError:
+        return None
+    return None if np.isnan(value) else value
 
 
 def _leaders(joints: list[_Joint], file: str) -> dict[str, Follows]:

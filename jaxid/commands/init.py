@@ -151,11 +151,11 @@ def init(
         key = "urdf" if mjcf is None else "mjcf"
         words = (UNKNOWN_OF_FORCES if chosen.force else UNKNOWN_OF_SERVOS) if unknown is None else unknown
         sections = draft.tree(robot, Path(robot.file), key, chosen.joints, words)
-        if unit := draft.unit_of_force:
+        if (unit := draft.unit_of_force) and {"base", "all"} & {*words}:
             known, *others = draft.driven
             tried = with_gains(sections, dict.fromkeys(others, 1.0), known, unit)
             shown = _shown_gains(_first_case(raw.source, Path(folder), tried), log, others)
-            sections = with_gains(sections, shown, known, unit)
+            sections = with_gains(sections, shown, known, unit, [j for j in others if j not in shown])
     elif not chosen.force:
         sections = draft.without_force()
     else:

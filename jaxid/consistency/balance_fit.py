@@ -166,7 +166,8 @@ def rough_gains(machine: Machine, data: Prepared) -> RoughGains | None:
         data: The prepared log.
 
     Returns:
-        The fit; None if no gain is unknown, or all are, so that nothing has a scale.
+        The fit; None if no gain is unknown, or all are, so that nothing has a scale, or if the balance is
+        not finite.
     """
     parameters = machine.parameters
     gains = np.array([_is_gain(machine.plant, f) for f in parameters.free], dtype=bool)
@@ -196,6 +197,8 @@ def rough_gains(machine: Machine, data: Prepared) -> RoughGains | None:
     rows, target = (columns / size[:, None])[data.fitted], (-known / size)[data.fitted]
     norm = np.linalg.norm(rows, axis=0)
     norm = np.where(norm > 0, norm, 1.0)
+    if len(target) < rows.shape[1] or not (np.all(np.isfinite(rows)) and np.all(np.isfinite(target))):
+        return None
     left, strength, right = np.linalg.svd(rows / norm, full_matrices=False)
     seen = strength > _BLIND * strength[0]
     solved = right[seen].T @ ((left.T @ target)[seen] / strength[seen])

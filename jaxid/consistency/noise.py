@@ -68,7 +68,7 @@ def estimated_force_noise(
     fit: BalanceFit,
     law: Float[np.ndarray, "time m"] | None = None,
     *,
-    fast: bool = False,
+    fast: bool | None = False,
 ) -> ForceNoise:
     """Estimate the standard deviation of white noise of each logged force.
 
@@ -92,7 +92,7 @@ def estimated_force_noise(
         fit: Balance of the prepared log.
         law: Command of the declared control law at the logged readings, in units of the command; None: there
             is none that reproduces the logged one.
-        fast: Whether the loop is known to be faster than the log.
+        fast: Whether the loop is known to be faster than the log; None: it is known not to be.
     """
     high, in_band = _beyond_controller(machine, log, fast=fast), _in_band(machine, log, data, fit)
     # The high band has more frequencies than the band of a balance, and so the better estimate of one noise.
@@ -145,7 +145,9 @@ class _HighBand(NamedTuple):
     faster: bool
 
 
-def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False, likely: bool = False) -> _HighBand:
+def _beyond_controller(
+    machine: Machine, log: Log, *, fast: bool | None = False, likely: bool = False
+) -> _HighBand:
     """Return the noise of each force that no controller of the log's rate makes of its readings.
 
     A controller of the log's rate differentiates the noise of its readings over rows, and the force that it
@@ -160,8 +162,9 @@ def _beyond_controller(machine: Machine, log: Log, *, fast: bool = False, likely
             of.append(log.reference[:, min(k, log.reference.shape[1] - 1)])
         each.append(_unexplained(log.force[:, k], of))
 
-    shown = machine.controller is None and any(found.of_same_row(likely=fast or likely) for found in each)
-    faster = fast or shown
+    shown = fast is not None and machine.controller is None
+    shown = shown and any(found.of_same_row(likely=bool(fast) or likely) for found in each)
+    faster = bool(fast) or shown
     return _HighBand(
         noise=np.array([found.total if faster else found.left for found in each]),
         answer=np.array([found.factor if shown else 0.0 for found in each]),

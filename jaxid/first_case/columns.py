@@ -129,15 +129,18 @@ def columns_of(
 
 
 def _as_acceleration(column: Column, columns: Sequence[Column]) -> Column:
-    """Return a column called alpha as an acceleration, if a velocity stands beside it and not alpha_dot.
+    """Return a column called alpha as an acceleration, if a position and a velocity stand beside it.
 
-    Beside theta it is the second angle of a pendulum.
+    Beside theta and theta_dot it is the second angle of a pendulum, and so it is in degrees.
     """
     meaning = column.meaning
-    if meaning.symbol != "alpha" or meaning.quantity != "position":
+    if meaning.symbol != "alpha" or meaning.quantity != "position" or column.unit:
         return column
-    rates = [c.meaning.symbol for c in columns if c.meaning.quantity == "velocity"]
-    if not rates or "alpha" in rates:
+    measured = [c for c in columns if c is not column and not c.meaning.reference]
+    others = [c.meaning for c in measured if c.meaning.symbol != "alpha"]
+    speeds = [m for m in others if m.quantity == "velocity" and not m.symbol]
+    own = [c for c in measured if c.meaning.symbol == "alpha" and c.meaning.quantity == "velocity"]
+    if own or not speeds or not any(m.quantity == "position" for m in others):
         return column
     return replace(column, meaning=replace(meaning, quantity="acceleration"))
 
@@ -148,7 +151,8 @@ def _with_joints_by_symbol(columns: list[Column]) -> list[Column]:
     def named(column: Column) -> bool:
         return bool(column.meaning.symbol and not column.meaning.joint)
 
-    symbols = {c.meaning.symbol for c in columns if named(c) and c.meaning.quantity == "position"}
+    moving = [c.meaning for c in columns if named(c) and c.meaning.quantity in ("position", "velocity")]
+    symbols = {m.symbol for m in moving if not m.reference}
     if len(symbols) < 2:
         return columns
     by_symbol = lambda c: replace(c, meaning=replace(c.meaning, joint=(c.meaning.symbol,)))

@@ -46,8 +46,9 @@ class Draft:
 
     @property
     def unit_of_force(self) -> str:
-        """Unit of the forces where it is none of a torque, as "A"; empty otherwise, or without a force."""
-        return self._measures.labels.get("force", "") if self._chosen.force else ""
+        """Unit of the forces where they are currents, or per cent of the drives' rating; otherwise empty."""
+        unit = self._measures.labels.get("force", "") if self._chosen.force else ""
+        return unit if unit in ("A", "%") else ""
 
     @property
     def driven(self) -> tuple[int, ...]:
@@ -113,7 +114,7 @@ class Draft:
 
         if not chosen.force:
             plant.assumed.append("no force is logged: the file's position servos follow the reference")
-        elif robot.drives and chosen.force[0].meaning.quantity in ("torque", "force"):
+        elif robot.drives and chosen.force[0].meaning.quantity in ("torque", "force", "current"):
             if any(drive.gain != 1.0 or drive.drag or drive.limit for drive in robot.drives):
                 plant.keys["actuators"] = False
                 plant.assumed.append("the forces are those of the joints, behind the file's actuators")

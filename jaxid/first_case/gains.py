@@ -8,7 +8,11 @@ from jaxid.first_case.section import Section
 
 
 def with_gains(
-    sections: Sequence[Section], gains: Mapping[int, float], first: int, unit: str
+    sections: Sequence[Section],
+    gains: Mapping[int, float],
+    first: int,
+    unit: str,
+    unseen: Sequence[int] = (),
 ) -> list[Section]:
     """Return the sections of a robot's case with an unknown gain for some of its drives.
 
@@ -20,17 +24,24 @@ def with_gains(
         gains: Guesses of the gains by joint, 0-based.
         first: Joint in whose unit all forces are, 0-based.
         unit: Unit of the logged forces, for comments.
+        unseen: Joints whose gain the log does not show, 0-based.
     """
     added = [_section(joint, gain) for joint, gain in gains.items()]
     if added:
         joint = first + 1
         added[0].assumed.append(
-            f"one {unit} need not be the same torque at each joint: actuator_gain is that of its joint over "
-            f"that of joint {joint}, and forces are in {unit} of joint {joint}"
+            f"one {unit} need not be the same torque at each joint: actuator_gain is the torque at its joint "
+            f"over that at joint {joint}, and all results are in {unit} of joint {joint}"
         )
+        if unseen:
+            listed = ", ".join(str(k + 1) for k in unseen)
+            added[0].assumed.append(
+                f"the log does not show the gain of joint(s) {listed}: it counts as 1; see that the sign of "
+                "the force is right there"
+            )
         added[0].questions.append(
-            f"the torque of one {unit} at joint {joint}? Times it, all is in N m: gain = ... in [actuator] "
-            "for all joints, and no units in [plant]"
+            f"how large is the torque of one {unit} at joint {joint}? State it as gain = ... in [actuator], "
+            "for all joints, and take units out of [plant]: results are then in N m"
         )
     return [*sections, *added]
 

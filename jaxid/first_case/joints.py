@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def of_robot(
     Args:
         chosen: Columns of the log.
         names: Names of the robot's free joints.
-        actuated: Names of those that its actuators drive; empty: all.
+        actuated: Names of those that are driven; empty: the file does not say which.
         file: The robot's file, for messages.
         where: The log, for messages.
         to_tip: Whether the names are those up to a tip, which the log must all have.
@@ -49,45 +49,61 @@ def of_robot(
     else:
         some, words = tuple(names[k] for k in found), [keys[k] for k in found]
         picked = _of_joints(chosen, some, words, file, where, "; the others are held at zero")
-    return _with_forces_of_driven(picked, actuated, file)
+    return _with_forces_of_driven(picked, _words_of(picked, chosen), actuated, file)
 
 
-def _with_forces_of_driven(chosen: Chosen, actuated: Collection[str], file: str) -> Chosen:
-    """Return the columns with the forces of the joints that actuators drive, if the others have none.
+def _words_of(picked: Chosen, chosen: Chosen) -> list[set[str]]:
+    """Return the words that name each joint: those of the robot's file, and those of the log's columns."""
+    before = chosen.position or chosen.velocity
+    own = [
+        next(k for k, c in enumerate(before) if c is column) for column in picked.position or picked.velocity
+    ]
+    return [
+        {joint, " ".join(meaning_of(joint).joint), chosen.joints[k]} - {""}
+        for joint, k in zip(picked.joints, own, strict=True)
+    ]
 
-    They belong to the joints by their names, or in their order if there are as many. A single force is that
-    of the first joint where the file does not say which joints are driven, as of a pendulum on a cart.
+
+def _with_forces_of_driven(
+    chosen: Chosen, words: Sequence[set[str]], actuated: Collection[str], file: str
+) -> Chosen:
+    """Return the columns with the forces of the joints that are driven, if the others have none.
+
+    They belong to the joints by their names, or in their order if there are as many and none names another
+    joint. Of two joints of which the file does not say which is driven, a single force is that of the first,
+    as of a pendulum on a cart.
+
+    Args:
+        chosen: Columns of the robot's joints.
+        words: Words that name each joint.
+        actuated: Names of the joints that the file says are driven; empty: it does not say.
+        file: The robot's file, for messages.
     """
-    driven = tuple(k for k, name in enumerate(chosen.joints) if name in actuated)
-    loose = chosen.loose_forces
-    if loose and len(driven) in (0, len(chosen.joints)):
-        return _with_force_of_first(chosen, file)
-    if not loose:
+    loose, joints = chosen.loose_forces, chosen.joints
+    driven = tuple(k for k, name in enumerate(joints) if name in actuated)
+    if not loose or len(driven) == len(joints):
         return chosen
-    keys = [{chosen.joints[k], " ".join(meaning_of(chosen.joints[k]).joint)} for k in driven]
-    named = [[c for c in loose if " ".join(c.meaning.joint) in key] for key in keys]
-    if all(len(columns) == 1 for columns in named):
-        force = tuple(columns[0] for columns in named)
-    elif len(loose) == len(driven):
+    named = [next((k for k, of in enumerate(words) if " ".join(c.meaning.joint) in of), None) for c in loose]
+    unsure = [c for c, k in zip(loose, named, strict=True) if k is None and c.meaning.joint]
+    if not actuated and len(loose) == 1 and len(joints) == 2 and not unsure:
+        return _with_single_force(chosen, named[0] or 0, file)
+    if not driven or unsure:
+        return chosen
+    if all(named.count(k) == 1 for k in driven):
+        force = tuple(loose[named.index(k)] for k in driven)
+    elif len(loose) == len(driven) and not any(k is not None for k in named):
         force = loose
     else:
         return chosen
-    joints = ", ".join(chosen.joints[k] for k in driven)
-    columns = ", ".join(f"'{c.name}'" for c in force)
-    said = f"only {joints} of {Path(file).name} {'is' if len(driven) == 1 else 'are'} driven"
+    listed, columns = (", ".join(x) for x in ([joints[k] for k in driven], [f"'{c.name}'" for c in force]))
+    said = f"only {listed} of {Path(file).name} {'is' if len(driven) == 1 else 'are'} driven"
     said += f": {columns} {'is its force' if len(driven) == 1 else 'are their forces'}"
     return replace(chosen, force=force, driven=driven, said=(*chosen.said, said))
 
 
-def _with_force_of_first(chosen: Chosen, file: str) -> Chosen:
-    """Return the columns with a single force as that of the first joint, or of the one that it names."""
-    if len(chosen.loose_forces) != 1:
-        return chosen
-    force, joints = chosen.loose_forces[0], chosen.joints
-    word = " ".join(force.meaning.joint)
-    keys = [{joint, " ".join(meaning_of(joint).joint)} for joint in joints]
-    place = next((k for k, key in enumerate(keys) if word and word in key), 0)
-    joint = joints[place]
+def _with_single_force(chosen: Chosen, place: int, file: str) -> Chosen:
+    """Return the columns with a single force as that of one joint."""
+    [force], joint = chosen.loose_forces, chosen.joints[place]
     said = f"{Path(file).name} does not say which joints are driven: '{force.name}' is taken for the force "
     said += f"of {joint}, and no other joint has one"
     question = f'which joint does {force.name} drive? Name it in actuated, as actuated = ["{joint}"]'

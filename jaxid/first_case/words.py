@@ -15,12 +15,12 @@ _QUANTITIES: dict[str, str] = {
     "laufzeit zeitpunkt millis micros seconds",
     "position": "q p pos position positions lage stellung weg winkel drehwinkel angle angles ang s hub "
     "displacement encoder enc counts count inkremente increments ticks hoehe height distance dof pose",
-    "velocity": "qd v vel velocity velocities speed geschwindigkeit drehzahl omega rpm w",
+    "velocity": "qd v vel velocity velocities speed rate geschwindigkeit drehzahl omega rpm w",
     "acceleration": "qdd a acc accel acceleration beschleunigung vdot wdot omegadot",
     "torque": "tau torque torques trq moment drehmoment effort efforts tq mz",
     "force": "force forces kraft thrust schub f",
     "current": "current currents curr strom motorstrom i ia iq amps amp ampere",
-    "voltage": "voltage volt volts spannung ua uq va vm motorspannung",
+    "voltage": "voltage volt volts spannung ua uq motorspannung",
     "duty": "pwm duty dutycycle aussteuerung",
     "load": "load last",
     "command": "u input stellgroesse stellwert control ctrl",
@@ -38,16 +38,19 @@ _ROLES = {
 # Words that say nothing of a joint.
 _NOISE = (
     "joint joints states state js axis achse motor drive antrieb gelenk robot observation msg data est "
-    "estimated of the im am an der die das on at signal channel kanal ch filtered raw n no nr m g l angular "
-    "linear"
+    "estimated of the im am an der die das on at signal channel kanal ch filtered raw n no nr m g l dt"
 )
+# Words that say of a velocity how it moves, and name a joint otherwise.
+_KINDS = ("angular", "linear")
 # Symbols of coordinates, which name the joint where a log has several; their derivatives are dx and xdot.
-_SYMBOLS = frozenset("x y z th theta phi psi alpha beta gamma roll pitch yaw".split())
+_SYMBOLS = frozenset("x y z th theta phi psi alpha beta gamma".split())
+# Axes that name a joint beside other words, and are an angle alone.
+_AXES = ("roll", "pitch", "yaw")
 _TURNS = _SYMBOLS - {*"xyz"}
 # Separate words for derivatives by time.
 _DOTS = {"dot": 1, "punkt": 1, "ddot": 2, "dotdot": 2}
 _MOTION = ("position", "velocity", "acceleration")
-# Single letters whose case matters.
+# Letters whose case matters.
 _LETTERS = {
     "V": "voltage",
     "U": "voltage",
@@ -55,6 +58,8 @@ _LETTERS = {
     "F": "force",
     "M": "torque",
     "T": "temperature",
+    "Va": "voltage",
+    "Vm": "voltage",
 }
 # Quantities that a letter and one more letter stand for, as qm or qg.
 _OF_Q = re.compile(r"q[a-z]")
@@ -139,8 +144,11 @@ class _Words:
         self.roles: list[str] = []
         self.joint: list[str] = []
         self.words: list[str] = []
+        self.kinds: list[str] = []
         self.symbol = ""
-        self.derivatives = 0
+        # Derivatives that the coordinate is written with, as in dtheta, and those of words of their kind.
+        self.of_symbol = self.derivatives = 0
+        self.leading = ""
 
     def add(self, part: str, *, first: bool) -> None:
         """Add one part of the name."""
@@ -148,22 +156,27 @@ class _Words:
         moved = bool({*self._said()} & {*_MOTION})
         if word == "d" and not first and moved:
             self.roles.append("reference")  # theta_d is the desired angle
-        elif (word == "d" and first) or (word == "dd" and (first or moved)):
-            self.derivatives += len(word)
+        elif word in ("d", "dd") and first:
+            self.leading = word
+        elif word == "dd" and moved:
+            self.derivatives += 2
         elif word in _DOTS:
             self.derivatives += _DOTS[word]
         elif word in _DERIVATIVES:
-            symbol, order = _DERIVATIVES[word]
-            self.derivatives += order
-            self.add(symbol, first=False)
+            symbol, self.of_symbol = _DERIVATIVES[word]
+            self.symbol = self.symbol or symbol
+            self.words.append(symbol)
         elif word in _SYMBOLS:
             self.symbol = self.symbol or word
             self.words.append(word)
+        elif word in _KINDS:
+            self.kinds.append(word)
         elif part in _LETTERS:
             self.quantities.append(_LETTERS[part])
             self.words.append(word)
-        elif word == "a" and self.quantities:
-            self.words.append(word)  # of the armature, as in i_a
+        elif word == "a" and self._said():
+            # Of the armature, as in i_a, or the first of two, as in theta_a.
+            (self.joint if moved else self.words).append(word)
         else:
             self._add_pieces(word)
 
@@ -186,18 +199,34 @@ class _Words:
     def meaning(self, name: str, unit: str) -> Meaning:
         """Return the meaning of the name, which ends in this unit."""
         quantities, joint = self._said(), list(self.joint)
+        if not quantities and len(joint) == 1 and joint[0] in _AXES:
+            quantities = ["position"]
         moved = [q for q in quantities if q in _MOTION]
         if moved and "load" in quantities:
             # The position of a load is no load.
             quantities, joint = moved, [*joint, "load"]
+        quantity, order = _one(quantities), self.derivatives
+        if self.leading and quantity in _MOTION:
+            order += len(self.leading)
+        elif self.leading:
+            joint.insert(0, self.leading)
+        if not self.quantities:
+            order += self.of_symbol
+        elif quantity in _MOTION:
+            # Of vel_dx both words say the same.
+            order = max(order, self.of_symbol - _MOTION.index(quantity))
+        if self.kinds and quantity not in ("velocity", "acceleration"):
+            joint += self.kinds
+        if self.symbol and self.quantities and any(not word.isdigit() for word in joint):
+            joint.append(self.symbol)
         return Meaning(
             name=name,
-            quantity=_derived(_one(quantities), self.derivatives),
+            quantity=_derived(quantity, order),
             reference="reference" in self.roles and "actual" not in self.roles,
             joint=tuple(joint),
             unit=unit,
             words=frozenset(self.words),
-            symbol=self.symbol,
+            symbol="" if self.symbol == "q" else self.symbol,
         )
 
 

@@ -101,7 +101,8 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
     if free_hold:
         fast = loop_is_faster(machine, log, likely=hold == "linear")
         tick = faster_tick(machine, log, data, declared, fast=fast)
-    if tick is not None:
+    of_row = tick is not None and tick.period == log.period
+    if tick is not None and not of_row:
         findings.append(tick.finding(log))
         settings["tick"] = tick.setting()
         # Of the two courses that a simulation has, lines are nearer to a force that acts for half a row.
@@ -125,10 +126,11 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
 
     findings += weight_findings(machine, log, declared)
     made = replayed.command if replayed is not None and replayed.exact else None
-    noise = estimated_force_noise(machine, log, data, declared, made, fast=tick is not None)
+    fast = None if of_row else tick is not None
+    noise = estimated_force_noise(machine, log, data, declared, made, fast=fast)
     findings += noise_findings(machine, log, data, declared, noise.std)
     left_out = None if clipped is None else clipped[0]
-    held = None if tick is None else tick.period
+    held = None if tick is None or of_row else tick.period
     return AgainstCase(findings, hold, machine.reference_hold, noise, settings, left_out, held)
 
 

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.consistency.noise import loop_is_faster
 from jaxid.session import Session, open_another, open_session
 from truth.axis.cases import case_text
-from truth.axis.machines import Setup
+from truth.axis.machines import Setup, moves
 from truth.axis.slow_logs import HIDDEN, RATE, robot_joint, with_hidden
+from truth.axis.stepper import Loop, Machine, Sensor
 
 SETUP = robot_joint(0)[0]
 EFFECTS = SETUP.machine.effects
@@ -104,3 +106,20 @@ def test_values_of_a_faster_loop_hold_and_nothing_is_missing(every):
     assert tuple(fit.names) == ("inertia", "viscous_friction.coefficient", "coulomb_friction.level")
     frictions = (EFFECTS["viscous_friction"]["coefficient"], EFFECTS["coulomb_friction"]["level"])
     assert np.all(np.abs(fit.theta - [SETUP.machine.inertia, *frictions]) < 3 * fit.std)
+
+
+def test_a_filtered_derivative_at_the_rate_of_the_log_is_no_faster_loop():
+    """In the high band it answers to the reading of its row nearly alone, but its force acts for a row."""
+    t = np.arange(6000) / 1000.0
+    reference = moves(t, [0.0, 0.1, 0.3, 0.05], [0.1, 0.25, 0.05, 0.2], 2.0, 0.2)
+    loop = Loop("pid", reference=reference, kp=2e4, kd=180.0, ki=2e4, derivative_filter=0.002)
+    effects = {"viscous_friction": {"coefficient": 350.0}, "coulomb_friction": {"level": 45.0}}
+    machine = Machine(60.0, effects, actuator_gain=120.0)
+    setup = Setup(machine, loop, Sensor(1e-6, 3e-7, 0.01), rate=1000.0, duration=6.0, seed=1)
+    run = setup.run()
+    text = case_text(setup, tuple(effects.items()), sensor=False, closed=False)
+    session = open_session(tomllib.loads(text), {"t": run["t"], "q": run["position"], "u": run["force"]})
+    assert loop_is_faster(session.machine, session.fit.log), "by its noise alone it counts as faster"
+    assert "tick" not in session.settings
+    assert session.fit.data.hold == pytest.approx(1e-3)
+    assert not session.fit.data.faster_loop

@@ -45,8 +45,12 @@ def one_way(tmp_path_factory):
 @pytest.mark.slow
 def test_a_limit_that_all_of_the_force_exceeds_is_refused(one_way):
     """At the level of the friction it leaves no force, nor any need of an inertia: 47 rad off in the loop."""
-    refused = [s for r in one_way.rounds for s in r.step.scores if s.candidate.label == "saturation[1]"]
-    assert max(refused, key=lambda s: s.evidence).reason.startswith("motor_inertia would be next to nothing")
+    tried = [s for r in one_way.rounds for s in r.step.scores if s.candidate.label == "saturation[1]"]
+    # In the first round, and whenever it would explain something.
+    assert tried[0].reason.startswith("motor_inertia would be next to nothing")
+    for score in tried:
+        lost = score.reason.startswith("motor_inertia would be next to nothing")
+        assert lost or (score.evidence < 0 and score.reason == "it closes none of the gap")
     added = [r.step.added.candidate.kind for r in one_way.rounds if r.step.added]
     assert "saturation" not in added
 

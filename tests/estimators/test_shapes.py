@@ -69,6 +69,26 @@ def test_the_strength_needs_a_shape_larger_than_its_deviation(estimate, ratio, s
     }
 
 
+def test_a_lag_needs_no_strength():
+    case = {
+        "plant": {"kind": "axis", "parameters": {"inertia": {"guess": 2.0}}},
+        "effects": [{"kind": "actuator_lag", "time_constant": {"guess": 0.01}}],
+    }
+    machine = build_machine(load_case(case))
+    values = np.array([2.0, 0.01])
+    before = Estimate(
+        method="inverse_dynamics",
+        machine=machine.with_estimate(values),
+        theta=values,
+        precision=Precision(np.diag([1e-4, 0.02**2]), np.ones(2, bool), [], np.ones(2)),
+        converged=True,
+        message="converged",
+        residual=np.zeros((5, 1)),
+        samples=5,
+    )
+    assert without_unseen_shapes(before) is before
+
+
 @pytest.mark.parametrize("names", [(), ("inertia",), ("stribeck_friction.level",)])
 def test_whatever_has_no_unseen_shape_stays(estimate, names):
     before = blind(estimate, *names)

@@ -82,6 +82,49 @@ def test_the_name_of_a_force_names_its_joint(tmp_path):
     assert first.tables["plant"]["actuated"] == ["pivot"]
 
 
+@pytest.mark.parametrize(
+    ("effort", "columns"),
+    [(' effort="20"', ("x", "theta", "theta_torque")), ("", ("x", "theta", "wrist_torque"))],
+)
+def test_a_force_that_names_another_joint_is_not_that_of_the_driven_one(tmp_path, effort, columns):
+    log = cart_log(columns, seconds=1.0)
+    with pytest.raises(InputError, match=r"2 joints move \('x', 'theta'\), and not each has a force"):
+        jaxid.init(log, urdf=urdf(tmp_path, effort), folder=tmp_path)
+
+
+def test_a_single_force_of_a_robot_whose_joints_are_all_driven_is_refused(tmp_path):
+    path = urdf(tmp_path)
+    path.write_text(
+        path.read_text().replace(
+            '<axis xyz="0 1 0"/></joint>',
+            '<axis xyz="0 1 0"/><limit effort="3" velocity="9"/></joint>',
+        )
+    )
+    with pytest.raises(InputError, match="not each has a force"):
+        jaxid.init(cart_log(seconds=1.0), urdf=path, folder=tmp_path)
+
+
+@pytest.mark.parametrize("effort", ["inf", "${most}", ""])
+def test_a_limit_of_effort_that_is_no_number_stops_nothing(tmp_path, effort):
+    path = urdf(tmp_path, f' effort="{effort}"')
+    first = jaxid.init(cart_log(seconds=1.0), urdf=path, folder=tmp_path)
+    assert first.tables["plant"]["actuated"] == ["slider"]
+
+
+def test_a_stray_column_takes_no_position_servo_over(tmp_path):
+    log = cart_log(("a_pos", "b_pos", "voltage"), seconds=1.0)
+    log |= {"a_cmd": log["a_pos"], "b_cmd": log["b_pos"]}
+    path = tmp_path / "servos.xml"
+    body = '<body><joint name="{0}" axis="0 0 1"/><geom size="0.05" mass="1"/>{1}</body>'
+    path.write_text(
+        f"<mujoco><worldbody>{body.format('a', body.format('b', ''))}</worldbody><actuator>"
+        '<position joint="a" kp="5"/><position joint="b" kp="5"/></actuator></mujoco>'
+    )
+    table = jaxid.init(log, mjcf=path, folder=tmp_path).tables["log"]
+    assert "force" not in table
+    assert table["reference"] == {"a": "a_cmd", "b": "b_cmd"}
+
+
 def test_alpha_is_an_angle_unless_a_velocity_stands_beside_it(tmp_path):
     log = cart_log(("theta", "alpha", "tau"), seconds=1.0)
     both = log | {f"{name}_dot": np.gradient(log[name], log["t"]) for name in ("theta", "alpha")}

@@ -139,7 +139,9 @@ def without_unseen_shapes(estimate: Estimate) -> Estimate:
     if not shape.any():
         return estimate
 
-    vague = shape & identifiable & np.asarray([f.sign == "positive" for f in free])
+    # Behind a spring a small clearance is as good as none.
+    springs = [f.effect is not None and estimate.machine.plant.effects[f.effect].adds_spring for f in free]
+    vague = shape & identifiable & np.asarray([f.sign == "positive" for f in free]) & ~np.asarray(springs)
     vague &= ~(np.nan_to_num(estimate.std) < np.abs(estimate.theta))
     unseen = {f.effect for f, b in zip(free, vague | (shape & ~identifiable), strict=True) if b}
     # A shape without a strength, as the time constant of a lag, needs no other value.
@@ -163,9 +165,10 @@ def without_unseen_shapes(estimate: Estimate) -> Estimate:
         identifiable=identifiable & ~depends,
         unidentifiable=[*precision.unidentifiable, *({name: 1.0} for name in names)],
     )
-    note = (
-        f"{', '.join(names)}: not identifiable without the shape of the effect, which the log does not show"
-    )
+    how = "which the log does not show"
+    if vague[depends].any():
+        how = "whose standard deviation is as large as the shape"
+    note = f"{', '.join(names)}: not identifiable without the shape of the effect, {how}"
     return replace(estimate, precision=precision, notes=(*estimate.notes, note))
 
 
