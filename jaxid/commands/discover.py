@@ -189,7 +189,7 @@ def _explore_forces(
     where = where_of(search, steps[0], session)
     final, effects = _simulable(session, search, baseline.machine, steps, most, progress)
     verdict = "found" if effects else _verdict_on_none(where, steps, search, session, baseline.machine)
-    reading = force_reading(session, search, baseline.machine)
+    reading = force_reading(session, search, baseline.machine, steps)
 
     progress("refitting in simulation" if refit else "simulating")
     before = after = declared.result()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from jaxid.consistency.force_reading import ForceReading
 from jaxid.consistency.late_force import LateForce, late_force
 from jaxid.consistency.slow_force import SlowForce, slow_force
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.final import machine_with
-from jaxid.discovery.search import Search
+from jaxid.discovery.search import Model, Search, Step
 from jaxid.machine import Machine
 from jaxid.model.effect import Effect
 from jaxid.names import HOLDS
@@ -15,25 +17,37 @@ from jaxid.session import Session
 from jaxid.session.preparing import under_hold
 
 
-def force_reading(session: Session, search: Search, machine: Machine) -> ForceReading | None:
+def force_reading(
+    session: Session, search: Search, machine: Machine, steps: Sequence[Step] = ()
+) -> ForceReading | None:
     """Return a late or drifting reading of the force that explains one log as well as effects; None if none.
+
+    Where nothing was found, a late force is held against the best spring that was turned down, as the load
+    behind it was too heavy: a late force looks like one.
 
     Args:
         session: Case and logs.
         search: The search, at its end.
         machine: The machine of the case.
+        steps: Steps of the search.
     """
-    if not search.model.added or session.more:
+    if session.more:
         return None
-    return _late_force(session, search, machine) or _slow_force(session, search, machine)
+    if search.model.added:
+        return _late_force(session, search, machine, search.model) or _slow_force(session, search, machine)
+    scores = [s for step in steps for s in step.scores if s.reason and s.theta is not None]
+    springs = [s for s in scores if cand.effect_of(search.superset, s.candidate).adds_spring]
+    if not springs:
+        return None
+    best = max(springs, key=lambda s: s.evidence)
+    return _late_force(session, search, machine, Model((best.candidate,), best.refitted))
 
 
-def _late_force(session: Session, search: Search, machine: Machine) -> LateForce | None:
-    """Return the late force that explains the log as well as the effects that were found; None if none does.
+def _late_force(session: Session, search: Search, machine: Machine, model: Model) -> LateForce | None:
+    """Return the late force that explains the log as well as the effects of a model; None if none does.
 
     Those that shift the force in time are held against it first, then all.
     """
-    model = search.model
     whole, _ = machine_with(machine, search.superset, model.added, model.theta)
     data, held = session.fit.data, None
     if "hold" in session.settings:

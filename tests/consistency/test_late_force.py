@@ -107,7 +107,8 @@ def searched(log: dict[str, np.ndarray], **of_log: dict[str, float]) -> jaxid.Di
 def test_a_search_says_that_a_force_was_logged_late_and_how_to_take_it_back():
     log = logged(servo(), late_by_two)
     found = searched(log)
-    assert found.verdict == "found"
+    # The spring that looks like it has a load heavier than the joint: it is turned down.
+    assert found.verdict == "unexplained"
     assert found.force_reading is not None
     assert found.force_reading.delay == pytest.approx(2 * PERIOD, rel=0.02)
     assert found.findings[0].startswith("The force seems to be logged 2 ms late")
