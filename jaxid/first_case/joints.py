@@ -96,7 +96,7 @@ def _with_forces_of_driven(
     else:
         return chosen
     listed, columns = (", ".join(x) for x in ([joints[k] for k in driven], [f"'{c.name}'" for c in force]))
-    said = f"only {listed} of {Path(file).name} {'is' if len(driven) == 1 else 'are'} driven"
+    said = f"only {listed} of {Path(file).name} {'has' if len(driven) == 1 else 'have'} an actuator"
     said += f": {columns} {'is its force' if len(driven) == 1 else 'are their forces'}"
     return replace(chosen, force=force, driven=driven, said=(*chosen.said, said))
 
