@@ -100,7 +100,7 @@ class Draft:
         servos = {drive.joint for drive in robot.drives if drive.kp is not None}
 
         if not chosen.force and not (chosen.reference and set(names) <= servos):
-            raise lacking_force(chosen, self._raw.source)
+            raise lacking_force(chosen, self._raw.source, of_robot=True)
         if chosen.driven is not None and not robot.drives:
             plant.keys["actuated"] = [names[k] for k in chosen.driven]
         plant.keys["unknown"] = [*unknown]

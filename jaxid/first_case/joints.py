@@ -13,6 +13,10 @@ from jaxid.first_case.columns import Chosen, Column
 from jaxid.first_case.words import meaning_of
 
 NO_FORCE_HINT = "log the torque or the current of the drives with its sign, and name it so"
+_BY_JOINT_HINT = (
+    "name each force by its joint, as elbow_torque; or write the case by hand, where actuated = [...] in "
+    "[plant] lists the joints with a force"
+)
 _SOME_FORCES_HINT = (
     "name the robot's model by --mjcf or --urdf, which says what drives which joint; or write the case by "
     "hand, as of a motor and a load (flexible_axis) or of masses in a row (chain with actuated)"
@@ -169,9 +173,17 @@ def need_forces(chosen: Chosen, where: str) -> None:
         raise lacking_force(chosen, where)
 
 
-def lacking_force(chosen: Chosen, where: str) -> InputError:
-    """Return the error that a log has no force, or not one for each joint that needs one."""
-    hint = _SOME_FORCES_HINT if chosen.loose_forces else NO_FORCE_HINT
+def lacking_force(chosen: Chosen, where: str, *, of_robot: bool = False) -> InputError:
+    """Return the error that a log has no force, or not one for each joint that needs one.
+
+    Args:
+        chosen: Columns of the log.
+        where: The log, for messages.
+        of_robot: Whether the joints are those of a robot's file.
+    """
+    hint = NO_FORCE_HINT
+    if chosen.loose_forces:
+        hint = _BY_JOINT_HINT if of_robot else _SOME_FORCES_HINT
     return InputError(no_force(chosen), where=where, hint=hint)
 
 

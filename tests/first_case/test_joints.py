@@ -88,7 +88,7 @@ def test_the_name_of_a_force_names_its_joint(tmp_path):
 )
 def test_a_force_that_names_another_joint_is_not_that_of_the_driven_one(tmp_path, effort, columns):
     log = cart_log(columns, seconds=1.0)
-    with pytest.raises(InputError, match=r"2 joints move \('x', 'theta'\), and not each has a force"):
+    with pytest.raises(InputError, match=r"\('x', 'theta'\), and not each has a force.*elbow_torque"):
         jaxid.init(log, urdf=urdf(tmp_path, effort), folder=tmp_path)
 
 
