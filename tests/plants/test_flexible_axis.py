@@ -240,13 +240,6 @@ def test_an_open_loop_with_a_clearance_is_doubted(tmp_path, folder):
     assert "hangs on every impact in a clearance" in said[1]
 
 
-KNOWN = pytest.mark.xfail(
-    strict=True,
-    reason="the law gives the force to 3e-6 V, under which the rounded corner of the clearance moves both "
-    "Coulomb frictions by 1.5e-4 of their value, 4 standard deviations",
-)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("loop", "method"),
@@ -254,7 +247,7 @@ KNOWN = pytest.mark.xfail(
         ("open", "prediction_error"),
         ("closed", "output_error"),
         ("closed", "inverse_dynamics"),
-        pytest.param("closed", "prediction_error", marks=KNOWN),
+        ("closed", "prediction_error"),
     ],
 )
 def test_a_known_clearance_is_fitted_from_both_encoders(tmp_path, loop, method):
