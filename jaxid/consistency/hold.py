@@ -72,10 +72,14 @@ def better_hold(
     return (other, gaps[:, least]) if better else None
 
 
+def shifts_force(machine: Machine) -> bool:
+    """Check whether the machine has an effect that shifts the force in time by itself."""
+    return any(e.shifts_time for e in machine.plant.effects)
+
+
 def shifts_in_time(machine: Machine, data: Prepared) -> bool:
     """Check whether a drive shifts its force in time, or the filter ignores for how long a force acts."""
-    drives = any(e.shifts_time for e in machine.plant.effects)
-    return drives or not data.recipe.align_hold
+    return shifts_force(machine) or not data.recipe.align_hold
 
 
 def residual_held(

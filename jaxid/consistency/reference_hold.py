@@ -9,7 +9,7 @@ import scipy.signal
 from jaxtyping import Float
 
 from jaxid.consistency.balance_fit import BalanceFit
-from jaxid.consistency.hold import clearly_better, with_friction
+from jaxid.consistency.hold import clearly_better, shifts_force, with_friction
 from jaxid.consistency.law import law_at_ticks
 from jaxid.logs.finding import Finding
 from jaxid.logs.log import Log
@@ -74,7 +74,7 @@ def compare_reference_holds(
         return None
     if machine.unknown_controller:
         return None
-    if any(e.shifts_time for e in machine.plant.effects):
+    if shifts_force(machine):
         return ReferenceHold({}, None, "an effect of the drive changes the force in time")
     laws = {hold: law_at_ticks(replace(machine, reference_hold=hold), log) for hold in HOLDS}
     commands = {hold: law for hold, law in laws.items() if law is not None}

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxid.consistency.balance_fit import BalanceFit
-from jaxid.consistency.hold import clearly_better, with_friction
+from jaxid.consistency.hold import clearly_better, shifts_force, with_friction
 from jaxid.consistency.late_force import plain
 from jaxid.consistency.late_model import LateModel, least_near
 from jaxid.logs.finding import Finding
@@ -25,11 +25,6 @@ _FEWEST, _MOST = 100, 8000
 _BESIDE = 3
 # Beginning of the finding.
 SEEMS = "the force seems to be logged"
-
-
-def shifts_force(machine: Machine) -> bool:
-    """Check whether the machine has an effect that shifts the force in time by itself."""
-    return any(e.shifts_time for e in machine.plant.effects)
 
 
 def states_delay(table: LogTable | None) -> bool:

@@ -22,8 +22,8 @@ def force_reading(
 ) -> ForceReading | None:
     """Return a late or drifting reading of the force that explains one log as well as effects; None if none.
 
-    Where nothing was found, a late force is held against the best spring that was turned down, as the load
-    behind it was too heavy: a late force looks like one.
+    Where nothing was found, a late force is held against the best spring that was turned down: a late force
+    looks like one with a heavy load.
 
     Args:
         session: Case and logs.

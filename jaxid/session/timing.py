@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from jaxid.consistency.timing import shifts_force, states_delay
+from jaxid.consistency.hold import shifts_force
+from jaxid.consistency.timing import states_delay
 from jaxid.logs.finding import Finding
 from jaxid.logs.late import earlier
 from jaxid.machine import Machine

@@ -157,6 +157,13 @@ def test_checks_begin_at_the_rough_gains(arm):
     np.testing.assert_allclose(session.fit.data.force_noise, right.fit.data.force_noise, rtol=0.02)
 
 
+def test_the_time_for_which_a_current_acts_is_found_beside_unknown_gains(arm):
+    first, _ = arm
+    session = jaxid.open_session(first.case(), recorded(TwoLinks(), CONSTANTS, 0, rate=200))
+    assert "tick" in session.settings
+    assert session.fit.data.faster_loop
+
+
 def test_slides_that_do_not_push_each_other_show_no_ratio(tmp_path):
     t = np.arange(5000) / 500
     path = tmp_path / "gantry.urdf"

@@ -130,9 +130,7 @@ def without_unseen_shapes(estimate: Estimate) -> Estimate:
     """Return the estimate with the unknowns of an effect not identifiable if its shape is not.
 
     A shape that the log does not show ends anywhere. The standard deviation of the strength then holds for
-    that value of the shape only. So it does where the deviation of a positive shape is as large as its value:
-    a strength that is 70 times too small had an interval 40 times too short, at a velocity 30 times too
-    large.
+    that value of the shape only. So it does where the deviation of a positive shape is as large as its value.
     """
     free, identifiable = estimate.machine.parameters.free, estimate.identifiable
     shape = shapes(estimate.machine)
