@@ -40,11 +40,14 @@ if TYPE_CHECKING:
 
 
 def _inverse_dynamics(session: Session) -> Steps[Estimate]:
+    from jaxid.estimators.reading_noise import without_reading_noise
+
     if session.more:
         from jaxid.estimators.several.force import inverse_dynamics_steps as together
         from jaxid.estimators.several.parts import parts_of
 
-        return (yield from together(session.machine, parts_of(session)))
+        estimate = yield from together(session.machine, parts_of(session))
+        return (yield from without_reading_noise(session, estimate))
     from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
 
     if session.fit.log.steady is not None:
@@ -52,11 +55,7 @@ def _inverse_dynamics(session: Session) -> Steps[Estimate]:
 
         return (yield from steady_fit(session))
     estimate = yield from inverse_dynamics_steps(session.machine, session.fit.data)
-    if not session.fit.log.integrated:
-        return estimate
-    from jaxid.estimators.velocity_noise import without_velocity_noise
-
-    return (yield from without_velocity_noise(session, estimate))
+    return (yield from without_reading_noise(session, estimate))
 
 
 def _output_error(

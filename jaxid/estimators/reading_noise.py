@@ -1,0 +1,391 @@
+"""Bias that the noise of the readings causes in inverse dynamics, and its removal.
+
+Position, velocity and acceleration are regressors of the balance of forces. Their noise makes coefficients
+too small, although it does not correlate with the force. The elongation of a stiff coupling between two
+encoders may be noise for the most part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxid.estimators.common.joint_weights import joint_weights
+from jaxid.estimators.estimate import Estimate
+from jaxid.estimators.several.parts import Part, parts_of
+from jaxid.logs.log import Log
+from jaxid.logs.prepare import motion
+from jaxid.machine import Machine
+from jaxid.numerics.lanes import SolveRequest, Steps
+from jaxid.numerics.misspecified import std_under_misspecification, widening
+from jaxid.numerics.precision import Precision, precision_of_matrices
+from jaxid.numerics.rows import Rows
+from jaxid.session import Session
+from jaxid.simulation.force_balance import ForceData, force_and_columns, force_size, sharpened
+from jaxid.simulation.sensor_noise import position_noise
+
+# Simulated noise: as many pairs as give so many samples, within limits.
+_SAMPLES, _PAIRS = 4000, 8
+# Bias from which it is removed, in standard deviations of least squares.
+_MATTERS = 0.3
+# Uncertainty of the variance of the noise, as a part of it: the high band of a slow log holds motion, too.
+_UNCERTAIN = 0.1
+# Part of a direction's information that noise may make up for it to be identifiable: twice the uncertainty
+# must not reach the whole.
+_MOST = 1.0 / (1.0 + 2 * _UNCERTAIN)
+# Eigenvalue of the scaled normal matrix, over the largest, below which a direction is not identifiable.
+_BLIND = 1e-10
+# Most steps, and the last one in standard deviations.
+_STEPS, _SMALL = 4, 0.05
+
+
+@dataclass(frozen=True)
+class _Noisy:
+    """Sums of the equations of least squares, and what the noise of the readings adds to them on average.
+
+    Args:
+        normal: Matrix J'J, (p, p).
+        gradient: J'e, (p,).
+        of_noise: Part of the normal matrix by noise, (p, p).
+        bias: Part of the gradient by noise, (p,).
+    """
+
+    normal: Float[np.ndarray, "p p"]
+    gradient: Float[np.ndarray, " p"]
+    of_noise: Float[np.ndarray, "p p"]
+    bias: Float[np.ndarray, " p"]
+
+    def __add__(self, other: _Noisy) -> _Noisy:
+        return _Noisy(
+            self.normal + other.normal,
+            self.gradient + other.gradient,
+            self.of_noise + other.of_noise,
+            self.bias + other.bias,
+        )
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Solution of the equations without their noise.
+
+    Args:
+        step: From the values of the unknowns at which the equations stand, (p,).
+        least_squares: The same of the equations with their noise, (p,).
+        slope: Change of the step with the variance of the noise, over that variance, (p,).
+        matrix: Normal matrix without noise; zero in directions that noise dominates, (p, p).
+        hidden: Directions that noise dominates, (p, k).
+        share: Part of noise in the information of the direction that has most of it.
+    """
+
+    step: Float[np.ndarray, " p"]
+    least_squares: Float[np.ndarray, " p"]
+    slope: Float[np.ndarray, " p"]
+    matrix: Float[np.ndarray, "p p"]
+    hidden: Float[np.ndarray, "p k"]
+    share: float
+
+    @classmethod
+    def of(cls, sums: _Noisy) -> _Solution:
+        """Solve the equations in the directions that the log shows beyond its noise."""
+        size = np.sqrt(np.maximum(np.diag(sums.normal), 1e-300))
+        normal, noise = (x / np.outer(size, size) for x in (sums.normal, sums.of_noise))
+        values, vectors = np.linalg.eigh(normal)
+        seen = values > _BLIND * values[-1]
+        # Coordinates in which the normal matrix is one, and the noise's is diagonal.
+        white = vectors[:, seen] / np.sqrt(values[seen])
+        share, turned = np.linalg.eigh(white.T @ noise @ white)
+        out, back = white @ turned, (vectors[:, seen] * np.sqrt(values[seen])) @ turned
+        clear = share < _MOST
+
+        def step(noise: float) -> np.ndarray:
+            left = np.where(clear, 1.0 - noise * share, np.inf)
+            return out @ ((out.T @ ((noise * sums.bias - sums.gradient) / size)) / left) / size
+
+        return cls(
+            step=step(1.0),
+            least_squares=-(out @ (out.T @ (sums.gradient / size))) / size,
+            slope=(step(1.0 + _UNCERTAIN) - step(1.0 - _UNCERTAIN)) / (2 * _UNCERTAIN),
+            matrix=(back * np.where(clear, 1.0 - share, 0.0)) @ back.T * np.outer(size, size),
+            hidden=out[:, ~clear] / size[:, None],
+            share=float(share.max(initial=0.0)),
+        )
+
+
+@dataclass(frozen=True)
+class _Log:
+    """Balance of forces of one log, with the noise of its readings.
+
+    Args:
+        part: The log with its machine.
+        noise: Standard deviation of a reading of each joint, (n,).
+        weight: Weight of the rows of each joint, (n,).
+        size: 2-norm of the weighted measured force.
+        pairs: Number of pairs of simulated noise.
+    """
+
+    part: Part
+    noise: Float[np.ndarray, " n"]
+    weight: Float[np.ndarray, " n"]
+    size: float
+    pairs: int
+
+    @classmethod
+    def steps(cls, part: Part, theta: np.ndarray, *, several: bool) -> Steps[_Log]:
+        """Weigh the joints of a log, and the log among several, by what a fit leaves of them."""
+        data, rows = part.data, part.data.fitted
+        noise = np.where(part.log.measured, np.nan_to_num(position_noise(part.machine, part.log)), 0.0)
+        draft = cls(part, noise, np.ones(rows.shape[1]), 0.0, 0)
+        e, _ = yield draft.request(theta)
+        e = np.where(rows, np.asarray(e), 0.0)
+        plant = sharpened(part.machine.plant, data)
+        by_joint = joint_weights(plant, e, rows)
+        weight = draft.weight if by_joint is None else by_joint
+        if several:
+            weight = weight / max(float(np.sqrt(np.sum((weight * e) ** 2) / max(rows.sum(), 1))), 1e-300)
+        arrays = replace(ForceData.of(data, rows), weight=rows * weight)
+        size = float((yield SolveRequest(force_size, (plant, arrays))))
+        pairs = int(np.clip(np.ceil(0.5 * _SAMPLES / max(len(rows), 1)), 1, _PAIRS))
+        return cls(part, noise, weight, size, pairs)
+
+    def request(self, theta: np.ndarray, noise: np.ndarray | None = None) -> SolveRequest:
+        """Return the request for residual and Jacobian, with noise added to the readings, (time, n)."""
+        part, data = self.part, self.part.data
+        if noise is not None:
+            key = "velocity" if part.log.integrated else "position"
+            recipe = data.recipe
+            q, qd, qdd = motion(
+                replace(part.log, **{key: noise}),
+                recipe.cutoff_hz,
+                recipe.order,
+                recipe.derivatives,
+                recipe.reach,
+            )
+            force = data.force
+            if data.answer is not None:
+                driven = list(part.machine.plant.driven(part.machine.plant.joints))
+                force = force + noise[:, driven] * data.answer * part.machine.gain
+            data = replace(data, q=data.q + q, qd=data.qd + qd, qdd=data.qdd + qdd, force=force)
+        arrays, plant = ForceData.of(data, data.fitted), sharpened(part.machine.plant, part.data)
+        own = theta[part.index]
+        return SolveRequest(force_and_columns, (plant, part.machine.parameters.places, arrays, own))
+
+    def rows(self, found: tuple, width: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weighted residual and its Jacobian by all unknowns; zero for rows that do not count."""
+        counts = self.part.data.fitted
+        e = np.where(counts, np.asarray(found[0]) * self.weight, 0.0)
+        columns = np.where(counts[..., None], np.asarray(found[1]) * self.weight[:, None], 0.0)
+        return e, self.part.widened(columns, width)
+
+    def sums(self, theta: np.ndarray) -> Steps[_Noisy]:
+        """Return the sums of this log's equations, with what as much noise again adds to them.
+
+        Pairs of opposite noise leave its product with itself alone.
+        """
+        p, rng = theta.size, np.random.default_rng(0)
+        e, columns = self.rows((yield self.request(theta)), p)
+        flat = columns.reshape(-1, p)
+        normal, gradient = flat.T @ flat, flat.T @ e.ravel()
+        of_noise, bias = np.zeros_like(normal), np.zeros_like(gradient)
+        for _ in range(self.pairs):
+            drawn = self.noise * rng.standard_normal(self.part.log.position.shape)
+            pair = []
+            for sign in (0.5, -0.5):
+                pair.append(self.rows((yield self.request(theta, 2 * sign * drawn)), p))
+            (up, columns_up), (down, columns_down) = pair
+            flat = 0.5 * (columns_up - columns_down).reshape(-1, p)
+            of_noise += flat.T @ flat / self.pairs
+            bias += flat.T @ (0.5 * (up - down)).ravel() / self.pairs
+        return _Noisy(normal, gradient, of_noise, bias)
+
+
+def without_reading_noise(session: Session, estimate: Estimate) -> Steps[Estimate]:
+    """Return an estimate of inverse dynamics without the bias by the noise of its readings.
+
+    The noise adds its own products to the normal matrix and to the gradient of least squares. They are
+    simulated, and subtracted, where they move a value by a part of its standard deviation. A direction of
+    which noise makes up almost all information is not identifiable.
+
+    Args:
+        session: Case and logs.
+        estimate: Estimate of `inverse_dynamics`.
+
+    Returns:
+        The estimate; unchanged if the noise hardly moves it, or links are to be those of real bodies.
+
+    Source:
+        Fuller (1987), Measurement Error Models, chapter 2, for the correction by moments; Cook & Stefanski
+        (1994), JASA 89, for simulated noise.
+    """
+    machine = session.machine
+    if machine.parameters.bodies or not machine.parameters.free or not np.all(np.isfinite(estimate.theta)):
+        return estimate
+    several = bool(session.more)
+    parts = parts_of(session) if several else [Part.alone(machine, session.fit.log, session.fit.data)]
+    logs = []
+    for part in parts:
+        logs.append((yield from _Log.steps(part, np.asarray(estimate.theta), several=several)))
+    if not any(log.noise.any() for log in logs):
+        return estimate
+
+    theta, lower, upper = np.asarray(estimate.theta), *machine.parameters.bounds
+    # A coefficient that noise took to its bound may have taken others anywhere.
+    if np.any((theta <= lower) | (theta >= upper) | ~estimate.identifiable):
+        theta = machine.parameters.guess
+    solution = yield from _solved(logs, theta)
+    if solution is None:
+        return estimate
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bias = (solution.least_squares - solution.step) / estimate.std
+    largest = np.abs(np.where(np.isfinite(bias), bias, 0.0))
+    if solution.share < _MOST and largest.max() < _MATTERS:
+        return estimate
+    return (yield from _corrected(machine, estimate, logs, theta, solution))
+
+
+def _solved(logs: Sequence[_Log], theta: np.ndarray) -> Steps[_Solution | None]:
+    """Return the solution of the equations of all logs; None if they are not finite."""
+    sums: _Noisy | None = None
+    for log in logs:
+        own = yield from log.sums(theta)
+        sums = own if sums is None else sums + own
+    assert sums is not None, "there is at least one log"
+    if not all(np.all(np.isfinite(x)) for x in (sums.normal, sums.of_noise, sums.bias)):
+        return None
+    return _Solution.of(sums)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Values of the unknowns without the bias by noise.
+
+    Args:
+        rows: Residual and Jacobian of each log.
+        precision: Precision of the values.
+        ratio: Their standard deviations over those of least squares, (p,).
+        converged: Whether the next step is small.
+    """
+
+    rows: list[Rows]
+    precision: Precision
+    ratio: Float[np.ndarray, " p"]
+    converged: bool
+
+    @classmethod
+    def steps(
+        cls, machine: Machine, logs: Sequence[_Log], theta: np.ndarray, solution: _Solution
+    ) -> Steps[_Found]:
+        """Assess values of the unknowns, (p,), by the solution of the equations at them."""
+        rows = []
+        for log in logs:
+            e, columns = log.rows((yield log.request(theta)), theta.size)
+            rows.append(Rows(columns, e, log.part.data.fitted, log.size))
+        precision, ratio = _precision(machine.parameters.names, theta, logs, rows, solution)
+        change = np.clip(theta + solution.step, *machine.parameters.bounds) - theta
+        far = precision.identifiable & (np.abs(change) > _SMALL * precision.std)
+        return cls(rows, precision, ratio, not np.any(far))
+
+
+def _corrected(
+    machine: Machine, estimate: Estimate, logs: Sequence[_Log], theta: np.ndarray, solution: _Solution
+) -> Steps[Estimate]:
+    """Step to the solution without noise, and return it with its precision."""
+    found: _Found | None = None
+    for _ in range(_STEPS):
+        theta = np.clip(theta + solution.step, *machine.parameters.bounds)
+        again = yield from _solved(logs, theta)
+        if again is None:
+            return estimate
+        solution = again
+        found = yield from _Found.steps(machine, logs, theta, solution)
+        if found.converged:
+            break
+    assert found is not None, "there is at least one step"
+
+    residual = [
+        np.where(row.counts, row.residual / log.weight, np.nan)
+        for row, log in zip(found.rows, logs, strict=True)
+    ]
+    return replace(
+        estimate,
+        theta=theta,
+        machine=machine.with_estimate(theta),
+        precision=found.precision,
+        converged=found.converged,
+        message="converged" if found.converged else f"no convergence within {_STEPS} steps",
+        residual=np.concatenate(residual),
+        std_misspecified=std_under_misspecification(*_stacked(found.rows)) * found.ratio,
+        notes=(*estimate.notes, _words(logs[0].part.log, found.precision, solution.share)),
+        details={**estimate.details, "reading_noise": {"share": solution.share}},
+    )
+
+
+def _words(log: Log, precision: Precision, share: float) -> str:
+    """Return the note on what was removed, and on what noise hides."""
+    quantity = "velocity" if log.integrated else "position"
+    note = f"the bias by the noise of the measured {quantity} was removed"
+    if precision.identifiable.all():
+        return f"{note}: of one combination of the unknowns, {100 * share:.2g} % of the information is noise"
+    return (
+        f"{note}, and unknowns of which noise makes up the information count as not identifiable: a faster "
+        "log, finer encoders, or faster motion would show them; instrumental_variable may"
+    )
+
+
+def _precision(
+    names: list[str], theta: np.ndarray, logs: Sequence[_Log], rows: Sequence[Rows], solution: _Solution
+) -> tuple[Precision, Float[np.ndarray, " p"]]:
+    """Return the precision of a solution without noise, and its deviations over those of least squares.
+
+    Its normal matrix is smaller than that of least squares. The variance of the noise is uncertain, which
+    counts as one more error.
+    """
+    jacobian, e, counts = _stacked(rows)
+    norm = np.sqrt(np.maximum(np.sum(jacobian**2, axis=(0, 1)), 1e-300))
+    matrices = [row.matrices(norm) for row in rows]
+    normal, meat = (np.sum([pair[k] for pair in matrices], axis=0) for k in (0, 1))
+    signal = float(np.sqrt(sum(row.signal**2 for row in rows)))
+    plain = precision_of_matrices(names, normal, meat, norm, signal, None)
+    found = precision_of_matrices(names, solution.matrix / np.outer(norm, norm), meat, norm, signal, None)
+
+    if any(log.part.data.faster_loop for log in logs):
+        found = found.widened(widening(plain, jacobian, e, counts, [len(row.residual) for row in rows]))
+    by_noise = _UNCERTAIN * solution.slope
+    found = replace(found, covariance=found.covariance + np.outer(by_noise, by_noise))
+    found = _without_hidden(found, names, theta, solution.hidden)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = found.std / plain.std
+    return found, np.where(np.isfinite(ratio), ratio, 1.0)
+
+
+def _without_hidden(
+    precision: Precision, names: list[str], theta: np.ndarray, hidden: Float[np.ndarray, "p k"]
+) -> Precision:
+    """Return the precision without the unknowns that noise hides.
+
+    Along a hidden direction any value is possible. It hides an unknown that it moves by a part of its
+    standard deviation, until one of the unknowns is twice its value.
+    """
+    unidentifiable = []
+    for direction in hidden.T:
+        relative = direction / np.where(theta == 0, np.inf, theta)
+        most = float(np.max(np.abs(relative)))
+        moved = np.abs(direction) / (most or 1.0)
+        held = ~precision.identifiable | (moved > _MATTERS * precision.std)
+        seen = precision.identifiable & ~held
+        covariance = np.where(np.outer(seen, seen), precision.covariance, np.nan)
+        precision = replace(precision, covariance=covariance, identifiable=seen)
+        weights = relative / (np.linalg.norm(relative) or 1.0)
+        unidentifiable.append({n: float(w) for n, w, h in zip(names, weights, held, strict=True) if h and w})
+    return replace(precision, unidentifiable=unidentifiable) if unidentifiable else precision
+
+
+def _stacked(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Jacobian, residual and mask of all logs, one behind the other."""
+    return (
+        np.concatenate([row.jacobian for row in rows]),
+        np.concatenate([row.residual for row in rows]),
+        np.concatenate([row.counts for row in rows]),
+    )
