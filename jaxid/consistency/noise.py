@@ -258,11 +258,11 @@ def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.
     out = np.full(log.force.shape[1], np.inf)
     if not all(log.measured):
         return out
-    residual = fit.fit(bounded=False)[1]
+    values, residual = fit.fit(bounded=False)
     rate = log.rate_hz / data.recipe.decimation
     top = data.recipe.edge * log.rate_hz / 2 if data.recipe.edge else data.recipe.band_hz(log.rate_hz)
     top = min(top, 0.5 * rate)
-    f_all, of_position = position_density(machine, log, data)
+    f_all, of_position = position_density(_at(machine, fit, values), log, data)
     for k, joint in enumerate(machine.plant.driven(machine.plant.joints)):
         j = int(joint)
         f, power = _periodogram(residual[:, j], fit.counts[:, j], rate)
@@ -274,6 +274,18 @@ def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.
         density = max(float(np.median(white)), 0.0)
         out[k] = np.sqrt(density * log.rate_hz / 2) / abs(machine.gain[k])
     return out
+
+
+def _at(machine: Machine, fit: BalanceFit, values: np.ndarray) -> Machine:
+    """Return a machine at the values of a balance, which the guesses may be far from.
+
+    A value that its unknown cannot have leaves it at its guess.
+    """
+    theta, (lower, upper) = np.array(machine.parameters.guess, dtype=np.float64), machine.parameters.bounds
+    for free, value in zip(fit.unknowns, values, strict=False):
+        k = machine.parameters.names.index(free.name)
+        theta[k] = value if lower[k] < value < upper[k] else theta[k]
+    return machine.with_estimate(theta)
 
 
 def _periodogram(
