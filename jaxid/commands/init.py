@@ -17,6 +17,7 @@ from jaxid.errors import InputError
 from jaxid.files import write_whole
 from jaxid.first_case.columns import Chosen, choose, columns_of
 from jaxid.first_case.drafting import Draft
+from jaxid.first_case.flexible_draft import FlexibleDraft
 from jaxid.first_case.gains import with_gains
 from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_robot
 from jaxid.first_case.raw import raw_log
@@ -138,7 +139,8 @@ def init(
     raw = raw_log(log)
     robot = _robot(mjcf, urdf)
     names = () if robot is None else _joints_of(robot, urdf, tip)
-    chosen = choose(columns_of(raw.data, raw.units, raw.contents.time, names), raw.source)
+    columns = columns_of(raw.data, raw.units, raw.contents.time, names)
+    chosen = choose(columns, raw.source, of_robot=robot is not None)
     if robot is not None:
         chosen = of_robot(chosen, names, _actuated(robot), robot.file, raw.source, to_tip=tip is not None)
     elif len(chosen.joints) > 1:
@@ -146,7 +148,8 @@ def init(
         chosen = most_moved(chosen)
 
     motion = "" if robot is None else _motion_of(robot, next(iter(chosen.joints)))
-    draft = Draft(log, raw, chosen, measures_of(chosen, motion), Path(folder))
+    kind = Draft if chosen.load is None else FlexibleDraft
+    draft = kind(log, raw, chosen, measures_of(chosen, motion), Path(folder))
     if robot is not None:
         key = "urdf" if mjcf is None else "mjcf"
         words = (UNKNOWN_OF_FORCES if chosen.force else UNKNOWN_OF_SERVOS) if unknown is None else unknown

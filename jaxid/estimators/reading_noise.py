@@ -169,8 +169,8 @@ class _Log:
                 force = force + noise[:, driven] * data.answer * part.machine.gain
             data = replace(data, q=data.q + q, qd=data.qd + qd, qdd=data.qdd + qdd, force=force)
         arrays, plant = ForceData.of(data, data.fitted), sharpened(part.machine.plant, part.data)
-        own = theta[part.index]
-        return SolveRequest(force_and_columns, (plant, part.machine.parameters.places, arrays, own))
+        places, values = part.machine.parameters.places, theta[part.index]
+        return SolveRequest(force_and_columns, (plant, places, arrays, values))
 
     def rows(self, found: tuple, width: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the weighted residual and its Jacobian by all unknowns; zero for rows that do not count."""
@@ -204,7 +204,7 @@ class _Log:
 def without_reading_noise(session: Session, estimate: Estimate) -> Steps[Estimate]:
     """Return an estimate of inverse dynamics without the bias by the noise of its readings.
 
-    The noise adds its own products to the normal matrix and to the gradient of least squares. They are
+    The noise adds its products to the normal matrix and to the gradient of least squares. They are
     simulated, and subtracted, where they move a value by a part of its standard deviation. A direction of
     which noise makes up almost all information is not identifiable.
 
@@ -249,8 +249,8 @@ def _solved(logs: Sequence[_Log], theta: np.ndarray) -> Steps[_Solution | None]:
     """Return the solution of the equations of all logs; None if they are not finite."""
     sums: _Noisy | None = None
     for log in logs:
-        own = yield from log.sums(theta)
-        sums = own if sums is None else sums + own
+        more = yield from log.sums(theta)
+        sums = more if sums is None else sums + more
     assert sums is not None, "there is at least one log"
     if not all(np.all(np.isfinite(x)) for x in (sums.normal, sums.of_noise, sums.bias)):
         return None

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.first_case.balance import has_direction
+from jaxid.first_case.two_encoders import without_load
 from jaxid.first_case.words import FORCES, Meaning, meaning_of_joint
 from jaxid.logs.log import MINIMUM_SAMPLES
 from jaxid.logs.readers.dialect import split_unit
@@ -66,6 +67,7 @@ class Chosen:
         position, velocity, force, reference: Columns by joint; empty: there are none.
         driven: Places of the joints that the forces belong to; None: there is one for each joint.
         loose_forces: Forces of a log of several joints that has not one for each of them.
+        load: Position of a load whose motor has an encoder too; None: there is none.
         joints: Words that name the joints; an empty text for a single one.
         said: Lines on choices that names do not show.
         questions: Doubts, by quantity.
@@ -78,6 +80,7 @@ class Chosen:
     reference: tuple[Column, ...] = ()
     driven: tuple[int, ...] | None = None
     loose_forces: tuple[Column, ...] = ()
+    load: Column | None = None
     joints: tuple[str, ...] = ("",)
     said: tuple[str, ...] = ()
     questions: Mapping[str, str] = field(default_factory=dict)
@@ -165,12 +168,13 @@ def _of_motion(unit: str) -> str:
     return next((q for q in ("position", "velocity") if fits(found, q)), "")
 
 
-def choose(columns: Sequence[Column], where: str) -> Chosen:
+def choose(columns: Sequence[Column], where: str, *, of_robot: bool = False) -> Chosen:
     """Choose the columns of a machine's log.
 
     Args:
         columns: All columns of the log.
         where: The log, for messages.
+        of_robot: Whether the joints are those of a robot's file, so that two positions are of two joints.
 
     Raises:
         InputError: If no column can be the position or the velocity of a joint.
@@ -182,6 +186,9 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
     questions: dict[str, str] = {}
     time = _time(columns, said, questions)
     rest = [c for c in columns if c is not time and c.meaning.quantity not in ("time", "passed over")]
+    if not any(c.meaning.quantity in ("position", "velocity") for c in rest):
+        rest = _named_by_unit(rest)
+    rest, load = (rest, None) if of_robot else without_load(rest)
 
     position, spare = _by_joint(rest, "position")
     velocity, _ = _by_joint(rest, "velocity")
@@ -207,6 +214,7 @@ def choose(columns: Sequence[Column], where: str) -> Chosen:
         force=tuple(force.values()),
         reference=tuple(reference.values()),
         loose_forces=loose_forces,
+        load=load,
         joints=joints,
         said=tuple(said),
         questions=questions,

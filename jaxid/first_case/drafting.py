@@ -23,6 +23,7 @@ from jaxid.logs.soundness import position_levels
 from jaxid.logs.units import Frame, parse_unit
 from jaxid.model.units import Units
 from jaxid.numerics.filters import high_band_std
+from jaxid.settings import Actuator
 
 _GRAVITY = 9.81
 # Mass times distance of a swing that nothing states [kg m].
@@ -70,7 +71,7 @@ class Draft:
             rough = rough_balance(
                 force, motion, float(np.median(np.diff(time))), rotary=rotary, of_velocity=not chosen.position
             )
-        rough, signs = _driven(rough)
+        rough, signs = driven_balance(rough)
         if signs:
             table.keys["sign"] = {"force": -1}
             table.assumed.append("the force as logged brakes the motion: its sign is turned")
@@ -296,9 +297,10 @@ class Draft:
                 "[[effects]]", {"kind": kind, key: {"guess": rounded(value)}}, {key: units.label(dimension)}
             )
 
+        viscous, coulomb = (positive_friction(rough, name) for name in ("viscous", "coulomb"))
         out = [
-            effect("viscous_friction", "coefficient", _positive(rough, "viscous"), "force*time/position"),
-            effect("coulomb_friction", "level", _positive(rough, "coulomb"), "force"),
+            effect("viscous_friction", "coefficient", viscous, "force*time/position"),
+            effect("coulomb_friction", "level", coulomb, "force"),
         ]
         if rough.spring is not None:
             out.append(effect("linear_stiffness", "coefficient", rough.spring, "force/position"))
@@ -379,8 +381,8 @@ class Draft:
 
     # reading
 
-    def _read(self, table: Section) -> Log:
-        """Read the log as the case will."""
+    def _read(self, table: Section, drive: Section | None = None) -> Log:
+        """Read the log as the case will, with the ratio of a gear if there is one."""
         columns = {
             key: list(value.values()) if isinstance(value, dict) and key != "units" else value
             for key, value in table.keys.items()
@@ -390,6 +392,7 @@ class Draft:
             motions=self._motions,
             driven=driven,
             labels=self._measures.labels,
+            actuator=Actuator() if drive is None else Actuator(gear_ratio=drive.keys["gear_ratio"]),
         )
         if self._empty():
             # A text table has such readings by itself; in other formats the case must say so.
@@ -430,7 +433,7 @@ class Draft:
         return even, np.interp(even, time, motion), np.interp(even, time, force)
 
 
-def _driven(rough: RoughBalance) -> tuple[RoughBalance, bool]:
+def driven_balance(rough: RoughBalance) -> tuple[RoughBalance, bool]:
     """Return the balance with the force turned if it brakes as logged, and whether it was."""
     if not rough.braked:
         return _plausible(rough), False
@@ -455,7 +458,7 @@ def _plausible(rough: RoughBalance) -> RoughBalance:
     return replace(rough, inertia=max(0.01 * size, 1e-9))
 
 
-def _positive(rough: RoughBalance, name: str) -> float:
+def positive_friction(rough: RoughBalance, name: str) -> float:
     """Return a friction of a rough balance, at least a small part of the force."""
     least = _LEAST * (rough.force or 1.0)
     if name == "viscous":

@@ -127,6 +127,9 @@ def measures_of(chosen: Chosen, robot: str = "") -> Measures:
         own = _stated(chosen.reference[0], "position")
         own = "" if counts and per_turn is None else own or units.get("position", "")
         units |= {"reference": own} if own else {}
+    if chosen.load is not None:
+        of_load = _stated(chosen.load, "position") or units.get("position", "")
+        units |= {"load_position": of_load} if of_load else {}
     return Measures(
         motion,
         {q: u for q, u in units.items() if u not in ("s", "m", "rad", "N", "N m")},

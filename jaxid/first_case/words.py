@@ -27,7 +27,7 @@ _QUANTITIES: dict[str, str] = {
     "temperature": "temp temperature temperatur",
     "passed over": "error err fehler schleppfehler schleppabstand following deviation abweichung vsupply "
     "supply bus battery batterie flag mode activated enabled index idx row rows sample samples counter "
-    "zaehler seq function id ud status power leistung energy friction reibung covariance dc link "
+    "zaehler seq function id ud status power leistung energy friction reibung covariance dc "
     "zwischenkreis",
 }
 _ROLES = {
@@ -73,8 +73,10 @@ _MEANING = {word: quantity for quantity, words in _QUANTITIES.items() for word i
 _DERIVATIVES = {
     pattern.format(symbol): (symbol, order)
     for symbol in (*_SYMBOLS, "q")
-    for pattern, order in (("d{}", 1), ("{}dot", 1), ("dd{}", 2), ("{}ddot", 2))
+    for pattern, order in (("d{}", 1), ("{}dot", 1), ("dd{}", 2), ("{}ddot", 2), ("{}dd", 2))
 }
+# Quantities along an axis, as in vx or Fz.
+_ALONG = {f"{q}{axis}": (_MEANING[q], axis) for q in "vf" for axis in "xyz"}
 _ROLE = {word: role for role, words in _ROLES.items() for word in words.split()}
 _SILENT = frozenset(_NOISE.split())
 # Words long enough to be parts of others, as in Lageistwert or TorqueActualValue, longest first.
@@ -154,8 +156,8 @@ class _Words:
         """Add one part of the name."""
         word = part.casefold()
         moved = bool({*self._said()} & {*_MOTION})
-        if word == "d" and not first and moved:
-            self.roles.append("reference")  # theta_d is the desired angle
+        if word == "d" and not first and (moved or {*self._said()} & {"torque", "force"}):
+            self.roles.append("reference")  # theta_d is the desired angle, tau_d the desired torque
         elif word in ("d", "dd") and first:
             self.leading = word
         elif word == "dd" and moved:
@@ -166,6 +168,11 @@ class _Words:
             symbol, self.of_symbol = _DERIVATIVES[word]
             self.symbol = self.symbol or symbol
             self.words.append(symbol)
+        elif word in _ALONG:
+            quantity, axis = _ALONG[word]
+            self.quantities.append(quantity)
+            self.symbol = self.symbol or axis
+            self.words.append(word)
         elif word in _SYMBOLS:
             self.symbol = self.symbol or word
             self.words.append(word)
@@ -199,6 +206,8 @@ class _Words:
     def meaning(self, name: str, unit: str) -> Meaning:
         """Return the meaning of the name, which ends in this unit."""
         quantities, joint = self._said(), list(self.joint)
+        if quantities == ["load"] and self.symbol in _TURNS:
+            quantities = ["position", "load"]  # theta_load is the angle of a load
         if not quantities and len(joint) == 1 and joint[0] in _AXES:
             quantities = ["position"]
         moved = [q for q in quantities if q in _MOTION]
@@ -217,7 +226,7 @@ class _Words:
             order = max(order, self.of_symbol - _MOTION.index(quantity))
         if self.kinds and quantity not in ("velocity", "acceleration"):
             joint += self.kinds
-        if self.symbol and self.quantities and any(not word.isdigit() for word in joint):
+        if self.symbol and {*self.quantities} - {"load"} and any(not word.isdigit() for word in joint):
             joint.append(self.symbol)
         return Meaning(
             name=name,
@@ -302,6 +311,11 @@ def _split(name: str) -> list[str]:
     # A current or a voltage of the q axis may be split by its sign.
     spaced = re.sub(r"(?i)\b([iu])_q\b", r"\1q", spaced)
     return re.findall(r"[A-Za-z]+|\d+|%", spaced)
+
+
+def parts_of(name: str) -> list[str]:
+    """Return the words of a name that signs, capitals and digits divide, in small letters."""
+    return [part.casefold() for part in _split(name.translate(_UMLAUTS))]
 
 
 def _pieces(word: str) -> list[str] | None:

@@ -135,7 +135,8 @@ def ratio_findings(
         q = log.position[:, joint]
         if np.ptp(q) == 0 or not log.measured[joint]:
             continue
-        if log.velocity is not None:
+        # A load behind a coupling may have no column for its velocity.
+        if log.velocity is not None and joint < log.velocity.shape[1]:
             where = f"{path}, velocity of joint {joint + 1}"
             findings += _compare_velocity(log.velocity[:, joint], q, log.period, motions[joint], where)
         if log.reference is not None and joint in reference_of:

@@ -13,6 +13,8 @@ from jaxid.session import Session, open_session
 from truth.axis.cases import case_text
 from truth.axis.machines import Setup, moves
 from truth.axis.stepper import Loop, Machine, Sensor
+from truth.chain.flexible_joints import GUESS, flexible_joint
+from truth.chain.flexible_joints import case as flexible_case
 
 # A ball screw as in a trace of a drive: 180 kg, 226.19 N/A, 1 um, 1 kHz, 30 mA of noise on the current.
 SECONDS, RATE, NOISE = 8.0, 1000.0, 0.03
@@ -71,6 +73,15 @@ def test_a_rough_command_that_is_logged_exactly_has_no_noise(loop, closed):
 def test_one_sample_in_ten_of_the_loop_is_enough():
     session = opened(setup(), every=10)
     assert floor(session) == pytest.approx(floor(session, NOISE), rel=0.2)
+
+
+@pytest.mark.parametrize("seed", [1, 5])
+def test_guesses_far_off_hide_no_noise(seed):
+    """At guesses of inertia and stiffness the readings alone seemed to make more noise than there is."""
+    joint = flexible_joint(seed)
+    assert GUESS["load_inertia"] > 1.2 * joint.true["load_inertia"]
+    session = open_session(flexible_case(), joint.log(1000.0, 6.0))
+    assert session.fit.data.force_noise == pytest.approx([0.01], rel=0.1)
 
 
 @pytest.mark.parametrize("every", [4, 10])

@@ -64,6 +64,14 @@ NAMES = {
     "q_d": "position wanted",
     "theta_d": "position wanted",
     "i_d": "current of d",
+    "tau_d": "torque wanted",
+    "xdd": "acceleration",
+    "vx": "velocity",
+    "Fx": "force",
+    # motor and load
+    "theta_load": "position of load",
+    "link_pos": "position of link",
+    "dc_link_voltage": "passed over of link",
     # coordinates and windings
     "alpha": "position",
     "yaw": "position of yaw",

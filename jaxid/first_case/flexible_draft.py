@@ -1,0 +1,125 @@
+"""The first case of a motor and a load behind a coupling, of which each has its encoder."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxid.first_case.balance import rough_balance
+from jaxid.first_case.columns import Column
+from jaxid.first_case.drafting import Draft, driven_balance, positive_friction
+from jaxid.first_case.section import Section, rounded
+from jaxid.first_case.two_encoders import ratio_of_strokes
+
+# Resonance of a coupling [Hz] and its damping ratio that nothing states.
+_RESONANCE, _DAMPED = 20.0, 0.05
+# Ratio of the strokes of motor and load from which there is a gear; within so much of a whole one it is that.
+_GEARED, _WHOLE = 1.1, 2e-3
+
+
+class FlexibleDraft(Draft):
+    """The sections of the case of a joint whose load has an encoder too."""
+
+    @property
+    def _load(self) -> Column:
+        load = self._chosen.load
+        assert load is not None, "the caller has seen it"
+        return load
+
+    def axis(self) -> list[Section]:
+        """Return the case of motor and load; of the motor alone if the units of the two do not compare.
+
+        The guesses are those of a rigid joint, half of it on each side, with a resonance that is usual.
+        """
+        if len(self._chosen.position) != 1 or "position" in self._measures.labels or self._measures.unwrap:
+            return self._motor_alone()
+        chosen, units = self._chosen, self._units()
+        table = self._log_table()
+        table.keys["load_position"] = self._load.name
+        if (unit := self._measures.units.get("load_position")) is not None:
+            table.keys["units"] = {**table.keys.get("units", {}), "load_position": unit}
+        drive = self._gear(table)
+        gain = 1.0 if drive is None else drive.keys["gain"]
+        log = self._read(table, drive)
+        rotary = self._measures.motion == "rotary"
+        rough = rough_balance(gain * log.force[:, 0], log.position[:, 0], log.period, rotary=rotary)
+        rough, turned = driven_balance(rough)
+        if turned:
+            table.keys["sign"] = {"force": -1}
+            table.assumed.append("the force as logged brakes the motion: its sign is turned")
+            table.questions.append("is a positive force one that drives a positive velocity?")
+
+        half, omega = 0.5 * rough.inertia, 2 * np.pi * _RESONANCE
+        stiffness = omega**2 * 0.5 * half
+        plant = Section("[plant]", {"kind": "flexible_axis", "motion": self._measures.motion})
+        plant.assumed.append(
+            f"'{self._load.name}' has the course of '{chosen.position[0].name}' and names the load: it is "
+            "the load's encoder, behind a coupling that gives"
+        )
+        self._label(plant)
+        guesses = {
+            "motor_inertia": half,
+            "load_inertia": half,
+            "stiffness": stiffness,
+            "damping": 2 * _DAMPED * stiffness / omega,
+        }
+        keys: dict[str, Any] = {name: {"guess": rounded(value)} for name, value in guesses.items()}
+        load = log.load_position if log.load_position is not None else log.position
+        offset = float(np.median(load[:, 0] - log.position[:, 0]))
+        keys["zero_offset"] = {"guess": rounded(offset)}
+        labels = {name: units.label("inertia") for name in ("motor_inertia", "load_inertia")}
+        labels |= {"stiffness": units.label("force/position"), "damping": units.label("force*time/position")}
+        values = Section("[plant.parameters]", keys, labels)
+        values.assumed.append(
+            f"guesses are those of a rigid joint, halved, and a resonance of {_RESONANCE:g} Hz"
+        )
+
+        def both(kind: str, key: str, value: float, dimension: str) -> Section:
+            guess = {"guess": rounded(0.5 * value)}
+            return Section("[[effects]]", {"kind": kind, key: [guess, guess]}, {key: units.label(dimension)})
+
+        viscous, coulomb = (positive_friction(rough, name) for name in ("viscous", "coulomb"))
+        return [
+            plant,
+            values,
+            both("viscous_friction", "coefficient", viscous, "force*time/position"),
+            both("coulomb_friction", "level", coulomb, "force"),
+            *([drive] if drive is not None else []),
+            table,
+        ]
+
+    def _gear(self, table: Section) -> Section | None:
+        """Return the table of a gear between two encoders; None if there is none."""
+        [motor], load = self._chosen.position, self._load
+        slope = ratio_of_strokes(motor.values, load.values)
+        slope *= self._factor("position") / self._factor("load_position")
+        if 1 / _GEARED < slope < _GEARED:
+            return None
+        whole = round(slope)
+        ratio = float(whole) if whole and abs(slope / whole - 1) < _WHOLE else rounded(slope, 5)
+        table.keys["position_at"] = "motor"
+        drive = Section("[actuator]", {"gear_ratio": ratio})
+        drive.assumed.append(f"the motor turns {slope:.6g} times as far as the load")
+        drive.questions.append("is this the ratio of the gear?")
+        labelled = "force" in self._measures.labels
+        drive.keys["gain"] = 1.0 if labelled else ratio
+        if not labelled:
+            question = "is the force that of the motor? If it is that behind the gear, gain = 1.0"
+            drive.questions.append(question)
+        reference = self._chosen.reference
+        if reference and np.ptp(reference[0].values) < 0.5 * np.ptp(motor.values):
+            del table.keys["reference"]
+            table.assumed.append(f"'{reference[0].name}' is not used: it moves as far as the load")
+        return drive
+
+    def _motor_alone(self) -> list[Section]:
+        """Return the case of the motor alone, with what to state for one of both."""
+        sections = super().axis()
+        table = next(section for section in sections if section.head == "[log]")
+        table.questions.append(
+            f"'{self._load.name}' seems to be the encoder of a load behind the motor, which this case leaves "
+            'out: how large is one count of each? With units = { position = "0.044 deg", load_position = '
+            '"0.018 deg" } the case can be one of kind = "flexible_axis" (docs/case_file.md)'
+        )
+        return sections

@@ -1,0 +1,85 @@
+"""First cases of a motor and a load behind a coupling, each with its encoder, on an exact log."""
+
+import numpy as np
+import pytest
+
+import jaxid
+from jaxid.first_case.two_encoders import ratio_of_strokes
+from tests.estimators.test_reading_noise import SOFT, deviations
+from truth.chain.flexible_joints import flexible_joint
+
+JOINT = flexible_joint(SOFT)
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Return the log of the joint at the rate of its loop."""
+    return JOINT.log(1000.0)
+
+
+@pytest.mark.parametrize(
+    ("motor", "load"),
+    [
+        ("theta_m", "theta_l"),
+        ("q_motor", "q_link"),
+        ("motor_pos", "joint_pos"),
+        ("primary_encoder", "secondary_encoder"),
+        ("Motorposition", "Lastposition"),
+        ("theta", "theta_load"),
+    ],
+)
+def test_names_of_two_encoders_are_read(log, motor, load):
+    case = jaxid.init({"t": log["t"], load: log["q_load"], motor: log["q_motor"], "torque": log["torque"]})
+    tables = case.tables
+    assert tables["plant"]["kind"] == "flexible_axis"
+    assert tables["log"] == {"time": "t", "position": motor, "load_position": load, "force": "torque"}
+    assert any(load in line and "coupling" in line for line in case.assumed)
+
+
+def test_two_joints_of_a_robot_are_no_motor_and_load(log):
+    """They may move together, and the first link has the word link in its name as well."""
+    names = {"link1_pos": "q_motor", "link2_pos": "q_load"}
+    table = {name: log[of] for name, of in names.items()} | {"t": log["t"]}
+    case = jaxid.init({**table, "link1_torque": log["torque"], "link2_torque": 0.5 * log["torque"]})
+    assert case.tables["plant"]["kind"] == "axis"
+
+
+def test_the_case_of_two_encoders_finds_the_truth(log):
+    columns = {"q_motor": log["q_motor"], "q_load": log["q_load"], "torque": log["torque"]}
+    table = {"t": log["t"], "dq_motor": np.gradient(log["q_motor"], log["t"]), **columns}
+    result = jaxid.identify(jaxid.init(table).case(), table)
+    z = deviations(result.estimate, JOINT.true)
+    assert np.all(np.abs(z) < 3.0), z
+    assert result.model_complete
+
+
+def test_a_gear_between_two_encoders_is_found_exactly(log):
+    """A motor that moves 50 times as far, in degrees, with its torque: stiffness and inertias at the load."""
+    table = {
+        "t": log["t"],
+        "motor position [deg]": np.rad2deg(50 * log["q_motor"]),
+        "load position [deg]": np.rad2deg(log["q_load"]),
+        "motor torque [Nm]": log["torque"] / 50,
+    }
+    case = jaxid.init(table)
+    assert case.tables["actuator"] == {"gear_ratio": 50.0, "gain": 50.0}
+    assert case.tables["log"]["position_at"] == "motor"
+    assert any("is the force that of the motor" in line for line in case.questions)
+    result = jaxid.identify(case.case(), table)
+    assert result.estimate.value("stiffness") == pytest.approx(JOINT.true["stiffness"], rel=0.02)
+    assert result.estimate.value("load_inertia") == pytest.approx(JOINT.true["load_inertia"], rel=0.02)
+
+
+def test_the_resonance_does_not_move_the_ratio(log):
+    """A regression of the two positions alone is half a percent off where the load swings further."""
+    motor, load = log["q_motor"], log["q_load"]
+    assert ratio_of_strokes(80.0 * motor, load) == pytest.approx(80.0, rel=2e-4)
+
+
+def test_counts_of_two_encoders_ask_for_their_size(log):
+    table = {"t": log["t"], "torque": log["torque"]}
+    table |= {"motor_counts": np.round(log["q_motor"] / 1e-3), "load_counts": np.round(log["q_load"] / 2e-3)}
+    case = jaxid.init(table)
+    assert case.tables["plant"]["kind"] == "axis"
+    assert "load_position" not in case.tables["log"]
+    assert any("how large is one count of each" in line for line in case.questions)
