@@ -39,6 +39,7 @@ from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
 from jaxid.estimators.needs import need_force, need_known_controller, need_known_reference
+from jaxid.estimators.reading_noise import without_reading_noise
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
 from jaxid.estimators.several.parts import parts_of
 from jaxid.gap import Gap, filter_floor, force_gap, gaps, noise_floor
@@ -49,7 +50,7 @@ from jaxid.machine import Machine
 from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.numerics.lanes import Steps, begin, run_alone
 from jaxid.session import Logs, OpenedLog, Session, open_session
-from jaxid.session.holds import session_under_better_hold
+from jaxid.session.holds import session_of_faster_loop, session_under_better_hold
 from jaxid.simulation.force_balance import ForceData
 from jaxid.simulation.solvers import SOLVERS
 
@@ -179,7 +180,7 @@ def _explore_forces(
     steps = _searched(search, most)
     if (other := _under_better_hold(session, search, baseline.machine)) is not None:
         declared.cancel()
-        progress("searching under the other hold of the force")
+        progress("searching under another course of the force")
         return _explore_forces(other, most, refit=refit, experiments=experiments, progress=progress)
 
     likely, ahead = search.model, None
@@ -233,7 +234,7 @@ def _searched(search: Search, most: int) -> list[Step]:
 
 
 def _under_better_hold(session: Session, search: Search, machine: Machine) -> Session | None:
-    """Return the session under the other hold of its force, if what was found explains the log better so.
+    """Return the session under another course of its force, if what was found explains the log better so.
 
     Effects that shift the force in time may stand for a wrong hold: they are left out.
     """
@@ -242,6 +243,8 @@ def _under_better_hold(session: Session, search: Search, machine: Machine) -> Se
         return None
     added = [c for c in model.added if keeps_time(cand.effect_of(search.superset, c))]
     found, _ = machine_with(machine, search.superset, added, model.theta)
+    if (faster := session_of_faster_loop(session, found)) is not None:
+        return faster
     if len(added) == len(model.added):
         return session_under_better_hold(session, found)
     whole, _ = machine_with(machine, search.superset, model.added, model.theta)
@@ -400,8 +403,10 @@ def _of_force(session: Session) -> Estimate:
 
 def _of_force_steps(session: Session) -> Steps[Estimate]:
     if session.more:
-        return inverse_dynamics_of_several(session.machine, parts_of(session))
-    return inverse_dynamics_steps(session.machine, session.fit.data)
+        fit = inverse_dynamics_of_several(session.machine, parts_of(session))
+    else:
+        fit = inverse_dynamics_steps(session.machine, session.fit.data)
+    return (yield from without_reading_noise(session, (yield from fit)))
 
 
 def where_of(search: Search, baseline: Step, session: Session) -> Where:

@@ -249,6 +249,9 @@ class Acceptance:
         if heavier:
             return f"{heavier} would be more than the inertia of the joint, of which it is a part"
 
+        if self._within_a_row(index, new):
+            return "a force that acts less than half a row late is a matter of its course between the rows"
+
         if self._beyond_band(index, new):
             return "its ripple is beyond the band of the filter at nearly all speeds of the log"
 
@@ -293,6 +296,19 @@ class Acceptance:
             if new[i] > _HEAVIER * inertia_at(plant, int(plant.effects[f.effect].port)):
                 return f.name
         return ""
+
+    def _within_a_row(self, index: np.ndarray, new: np.ndarray) -> bool:
+        """Check for an added delay by which two courses of the force between its rows differ.
+
+        A held force and one on lines between the rows are half a row apart.
+        """
+        if not isinstance(self.domain, ForceDomain):
+            return False
+        machine = self.superset.machine
+        effects = machine.with_estimate(new).plant.effects
+        added = {f.effect for f in (machine.parameters.free[i] for i in index) if f.effect is not None}
+        delays = [float(effects[k].command_delay()) for k in added]
+        return 0.0 < max(delays, default=0.0) < 0.5 * self.data.period
 
     def _beyond_band(self, index: np.ndarray, new: np.ndarray) -> bool:
         """Check for an added ripple over the position that the filter removes nearly everywhere."""

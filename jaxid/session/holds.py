@@ -9,8 +9,10 @@ from jaxtyping import Float
 
 from jaxid.consistency.balance_fit import balance_fits
 from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
+from jaxid.consistency.noise import ForceNoise, estimated_force_noise, loop_is_faster
+from jaxid.consistency.tick import Tick, faster_tick
 from jaxid.machine import Machine
-from jaxid.session.opened import Session
+from jaxid.session.opened import OpenedLog, Session
 from jaxid.session.preparing import under_hold
 
 
@@ -59,3 +61,54 @@ def session_under_better_hold(
         settings={**session.settings, "hold": hold_setting(run.log.hold, *better, unit)},
         chooses_hold=False,
     )
+
+
+def session_of_faster_loop(session: Session, machine: Machine) -> Session | None:
+    """Return a session in which each force acts for the tick of a loop that is faster than its log.
+
+    A missing effect leaves so much that no tick is clearly better than another: the session may have seen
+    none with the effects of the case alone.
+
+    Args:
+        session: The session.
+        machine: The machine with the effects that a search found, without those that shift the force in time.
+
+    Returns:
+        The session with the tick and the reason for it; None if the hold is stated or the tick is known, or
+        if the log shows no faster loop.
+    """
+    run, chosen = session.fit, session.chooses_hold or "hold" in session.settings
+    if not chosen or run.log.passive or session.more or "tick" in session.settings:
+        return None
+    # With a force that is held for a row nothing is to be found, unless the noise shows a faster loop.
+    fast = loop_is_faster(run.machine(machine), run.log, likely=True)
+    if run.log.hold != "linear" and not fast:
+        return None
+    lines = under_hold("linear", run, replace(machine, hold="linear"))
+    at_fit = lines.machine(machine)
+    tick = faster_tick(at_fit, lines.log, lines.data, balance_fits(at_fit, lines.data)[0], fast=fast)
+    if tick is None or tick.period >= run.log.period:
+        return None
+    held = session_under_hold(session, "linear")
+    at_fit, data = held.fit.machine(machine), held.fit.data
+    noise = estimated_force_noise(at_fit, held.fit.log, data, balance_fits(at_fit, data)[0], fast=True)
+    return replace(
+        held,
+        fit=_at_tick(held.fit, tick, noise),
+        validations=tuple(_at_tick(other, tick, noise) for other in held.validations),
+        findings=(*session.findings, tick.finding(run.log)),
+        settings={**session.settings, "tick": tick.setting()},
+        chooses_hold=False,
+    )
+
+
+def _at_tick(run: OpenedLog, tick: Tick, noise: ForceNoise) -> OpenedLog:
+    """Return a log whose forces act for a tick, with their noise."""
+    data = replace(
+        run.data,
+        hold=tick.period,
+        force_noise=noise.std,
+        faster_loop=noise.faster_loop,
+        answer=noise.answer,
+    )
+    return replace(run, data=data)

@@ -58,6 +58,18 @@ def with_values(search, kind, values):
     return theta
 
 
+def test_a_delay_of_less_than_half_a_row_is_no_effect(axis):
+    """By half a row a held force and one on lines between the rows differ."""
+    session, search = axis
+    index = next(c for c in search.superset.candidates if c.kind == DELAY).index
+    period = session.fit.data.period
+    short, long = (with_values(search, DELAY, rows * period) for rows in (0.4, 0.6))
+    assert search.acceptance._within_a_row(index, short)
+    assert not search.acceptance._within_a_row(index, long)
+    lag = next(c for c in search.superset.candidates if c.kind == LAG).index
+    assert not search.acceptance._within_a_row(lag, with_values(search, LAG, 0.4 * period))
+
+
 def test_model_of_a_density_is_the_process_that_has_it():
     model, rate = NoiseModel(np.array([1.2, -0.5]), 0.3), 250.0
     # Twice the variance a unit of frequency: the density is one-sided.

@@ -22,6 +22,7 @@ GUESS = {"motor_inertia": 0.05, "load_inertia": 0.05, "stiffness": 100.0, "dampi
 HIDDEN = {
     "stribeck_friction": (1, {"level": 0.15, "velocity": 0.2}),
     "quadratic_drag": (2, {"coefficient": 0.02}),
+    "static_friction": (2, {"level": 0.1}),
     "cogging": (1, {"amplitude": 0.05, "period": 2 * np.pi / 12, "phase": 0.3}),
 }
 

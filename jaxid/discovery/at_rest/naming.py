@@ -10,6 +10,7 @@ import numpy as np
 from jaxid.discovery import candidates as cand
 from jaxid.discovery.at_rest.break_away import BreakAway, break_away
 from jaxid.discovery.at_rest.fading import Fading, fading_friction
+from jaxid.discovery.at_rest.holding_force import was_held
 from jaxid.discovery.result import NamedEffect
 from jaxid.discovery.score import Score
 from jaxid.discovery.search import Search, Step
@@ -64,7 +65,12 @@ def named_at_rest(
         leaving = break_away(found.estimate, session.runs, [c.port for c in missing])
         unseen = next((b for b in leaving if isinstance(b, str)), "")
         found = replace(found, unseen=unseen)
-        held = [b for b in leaving if isinstance(b, BreakAway) and b.holds]
+        machine, data = found.estimate.machine, session.fit.data
+        held = [
+            b
+            for c, b in zip(missing, leaving, strict=True)
+            if isinstance(b, BreakAway) and b.holds and was_held(machine, data, b, c.port)
+        ]
         if not held or len(found.effects) >= most:
             break
         # The clearest first: a joint that sticks makes its neighbours start late.
