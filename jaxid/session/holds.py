@@ -80,12 +80,8 @@ def session_of_faster_loop(session: Session, machine: Machine) -> Session | None
     run, chosen = session.fit, session.chooses_hold or "hold" in session.settings
     if not chosen or run.log.passive or session.more or "tick" in session.settings:
         return None
-    # With a force that is held for a row nothing is to be found, unless the noise shows a faster loop.
-    fast = loop_is_faster(run.machine(machine), run.log, likely=True)
-    if run.log.hold != "linear" and not fast:
-        return None
     lines = under_hold("linear", run, replace(machine, hold="linear"))
-    at_fit = lines.machine(machine)
+    at_fit, fast = lines.machine(machine), loop_is_faster(run.machine(machine), run.log, likely=True)
     tick = faster_tick(at_fit, lines.log, lines.data, balance_fits(at_fit, lines.data)[0], fast=fast)
     if tick is None or tick.period >= run.log.period:
         return None
