@@ -16,7 +16,7 @@ from truth.axis.cases import case_text
 from truth.axis.machines import EMPS_LOOP, Setup, emps_like, moves, multisine
 from truth.axis.slow_axis import slow_axis
 from truth.axis.stepper import Loop, Sensor
-from truth.chain import flexible_axes, stages
+from truth.chain import flexible_axes, flexible_joints, stages
 from truth.chain.stepper import ChainMachine, simulate_chain
 
 Run = tuple[str, dict[str, np.ndarray], dict[str, float]]
@@ -248,6 +248,14 @@ def stage(seed: int, loop: str, sensor: str) -> Run:
     return "\n".join(lines) + "\n", columns, true
 
 
+def flexible_joint(seed: int, loop: str, sensor: str) -> Run:
+    """Return case, columns and truth of a flexible joint with two encoders and a loop faster than its log."""
+    assert loop == "unknown", "its case states no loop"
+    joint, rates = flexible_joints.flexible_joint(seed), flexible_joints.LOG_RATES
+    log = joint.log(rates[seed % len(rates)])
+    return flexible_joints.text(sensor=sensor == "stated"), log, joint.true
+
+
 def _log_lines(positions, forces, loop: str, references) -> list[str]:
     """Return the table [log] for columns by joint; a log of an open loop has no reference."""
     row = lambda names: f'"{names}"' if isinstance(names, str) else str(list(names)).replace("'", '"')
@@ -270,4 +278,13 @@ MACHINES: dict[str, Callable[[int, str, str], Run]] = {
     "chain": chain,
     "arm": arm,
     "stage": stage,
+    "flexible_joint": flexible_joint,
 }
+# Machines that are not in every loop.
+ONLY_IN: dict[str, tuple[str, ...]] = {"flexible_joint": ("unknown",)}
+CELLS = [
+    f"{machine}/{loop}/{sensor}"
+    for machine in MACHINES
+    for loop in ONLY_IN.get(machine, LOOPS)
+    for sensor in SENSORS
+]

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import binom, chi2
 
 import jaxid
-from benchmarks.interval_machines import LOOPS, MACHINES, SENSORS
+from benchmarks.interval_machines import CELLS, MACHINES
 from benchmarks.stored_runs import append_runs, commit_of, read_runs
 from jaxid.estimators.estimate import Estimate
 
@@ -28,7 +28,6 @@ HERE = Path(__file__).parent / "results"
 CHUNK = 10
 # Guesses are half as large again as the truth, or smaller by as much.
 WITHIN_PRIOR = "[within_prior]\nprior = 0.5\n"
-CELLS = [f"{machine}/{loop}/{sensor}" for machine in MACHINES for loop in LOOPS for sensor in SENSORS]
 
 
 def run_chunk(

@@ -3,6 +3,7 @@
 The log holds every tick, or every second to eighth one. Machines, tours and noise are drawn.
 """
 
+import tomllib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,14 @@ LOG_RATES = (500.0, 200.0, 125.0)
 COUNT = 2 * np.pi / 2**17
 _SPEEDS = (0.5, 2.0, 6.0, 1.0)  # rad/s
 # Where every fit starts.
-GUESS = {"motor_inertia": 0.05, "load_inertia": 0.05, "stiffness": 100.0, "damping": 0.1}
+GUESS = {
+    "motor_inertia": 0.05,
+    "load_inertia": 0.05,
+    "stiffness": 100.0,
+    "damping": 0.1,
+    "zero_offset": 0.0,
+}
+FORCE_NOISE = 0.01  # N m
 # What may be hidden: joint and parameters, in N m.
 HIDDEN = {
     "stribeck_friction": (1, {"level": 0.15, "velocity": 0.2}),
@@ -79,7 +87,7 @@ class FlexibleJoint:
         loop = Loop(
             "cascade_pd", reference=reference, limit=20.0, kp=12.0, kv=40.0 * whole, velocity_average=4
         )
-        sensor = Sensor(position_resolution=COUNT, position_noise=0.5 * COUNT, force_noise=0.01)
+        sensor = Sensor(position_resolution=COUNT, position_noise=0.5 * COUNT, force_noise=FORCE_NOISE)
         log = simulate_chain(self.machine(), [loop], sensor, rate=RATE, duration=duration, seed=self.seed)
         every = round(RATE / rate)
         columns = {"t": log["t"], "q_motor": log["position"][:, 0], "q_load": log["position"][:, 1]}
@@ -103,18 +111,27 @@ def flexible_joint(seed: int) -> FlexibleJoint:
     return FlexibleJoint(seed, {name: float(value) for name, value in true.items()})
 
 
+def text(*, sensor: bool = False) -> str:
+    """Return the case of a joint as TOML, far from the truth: no controller is stated.
+
+    Args:
+        sensor: Whether the noise of the sensors is stated.
+    """
+    values = [f"{name} = {{ guess = {guess} }}" for name, guess in GUESS.items()]
+    lines = ["[plant]", 'kind = "flexible_axis"', 'motion = "rotary"', "[plant.parameters]", *values]
+    for kind, key, guesses in (
+        ("viscous_friction", "coefficient", (0.2, 0.2)),
+        ("coulomb_friction", "level", (0.05, 0.3)),
+    ):
+        by_joint = ", ".join(f"{{ guess = {guess} }}" for guess in guesses)
+        lines += ["[[effects]]", f'kind = "{kind}"', f"{key} = [{by_joint}]"]
+    lines += ["[log]", 'time = "t"', 'position = "q_motor"', 'load_position = "q_load"', 'force = "torque"']
+    if sensor:
+        noise = {"position_resolution": COUNT, "position_noise": 0.5 * COUNT, "force_noise": FORCE_NOISE}
+        lines += ["[sensor]", *(f"{name} = {value!r}" for name, value in noise.items())]
+    return "\n".join(lines) + "\n"
+
+
 def case() -> dict:
-    """Return the case of a joint, far from the truth: neither controller nor sensor is stated."""
-    values = {name: {"guess": guess} for name, guess in GUESS.items()}
-    return {
-        "plant": {
-            "kind": "flexible_axis",
-            "motion": "rotary",
-            "parameters": {**values, "zero_offset": {"guess": 0.0}},
-        },
-        "effects": [
-            {"kind": "viscous_friction", "coefficient": [{"guess": 0.2}, {"guess": 0.2}]},
-            {"kind": "coulomb_friction", "level": [{"guess": 0.05}, {"guess": 0.3}]},
-        ],
-        "log": {"time": "t", "position": "q_motor", "load_position": "q_load", "force": "torque"},
-    }
+    """Return the case of a joint as a table: neither controller nor sensor is stated."""
+    return tomllib.loads(text())
