@@ -1,5 +1,6 @@
 """The hold of the force, chosen again where a missing effect had hidden which one is right."""
 
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 import jaxid
 from jaxid.gap import force_gap
 from jaxid.session import open_session
-from jaxid.session.holds import session_under_better_hold
+from jaxid.session.holds import session_of_faster_loop, session_under_better_hold
+from truth.axis.cases import case_text
 from truth.axis.machines import moves
+from truth.axis.slow_logs import robot_joint, with_hidden
 from truth.axis.stepper import Loop, Machine, Sensor, simulate
 
 # A turntable in a loop of 1 kHz, of which one tick in four is logged.
@@ -52,6 +55,7 @@ def case(*, cogging: bool = False) -> dict:
 def shows_no_tick(monkeypatch):
     """Make the log one that does not show that its loop is faster."""
     monkeypatch.setattr("jaxid.session.against_case.faster_tick", lambda *_, **__: None)
+    monkeypatch.setattr("jaxid.session.holds.faster_tick", lambda *_, **__: None)
 
 
 @pytest.mark.usefixtures("shows_no_tick")
@@ -90,3 +94,41 @@ def test_a_search_names_no_effect_that_only_shifts_the_force(log):
     for name, true in {"inertia": 0.02, "coulomb_friction.level": 0.3, "cogging.amplitude": 0.2}.items():
         value = found.parameters[name]
         assert abs(value.value - true) < 3 * value.std
+
+
+def joint_without_its_curve(*, declared: bool = False) -> tuple[dict, dict[str, np.ndarray]]:
+    """Return the case of a joint, which may lack its Stribeck friction, and a log of every other tick."""
+    setup, rate = robot_joint(4)
+    known = tuple(setup.machine.effects.items())
+    setup = with_hidden(setup, "stribeck_friction")
+    known = tuple(setup.machine.effects.items()) if declared else known
+    run = setup.run(log_rate=rate)
+    tables = tomllib.loads(case_text(setup, known, motion="rotary", sensor=False, closed=False))
+    return tables, {"t": run["t"], "q": run["position"], "u": run["force"]}
+
+
+def test_what_was_missing_had_hidden_the_tick():
+    tables, log = joint_without_its_curve()
+    session = open_session(tables, log, align_hold=True, method="discover")
+    assert "tick" not in session.settings
+    assert session_of_faster_loop(session, session.machine) is None
+    whole, _ = joint_without_its_curve(declared=True)
+    machine = jaxid.identify(whole, log, method="inverse_dynamics").estimate.machine
+    other = session_of_faster_loop(session, machine)
+    assert other is not None
+    assert other.fit.data.hold == pytest.approx(1e-3)
+    assert other.fit.data.faster_loop
+    assert other.fit.log.hold == "linear"
+    assert "tick" in other.settings
+    assert session_of_faster_loop(other, machine) is None
+    # A hold that the case states stays.
+    assert session_of_faster_loop(replace(session, chooses_hold=False), machine) is None
+
+
+@pytest.mark.slow
+def test_no_spring_is_named_where_the_loop_is_faster():
+    """A joint_flexibility of 158 nats had stood beside the friction."""
+    tables, log = joint_without_its_curve()
+    result = jaxid.discover(tables, log)
+    assert result.kinds == ["stribeck_friction"]
+    assert result.model_complete
