@@ -250,7 +250,7 @@ class Acceptance:
             return f"{heavier} would be more than the inertia of the joint, of which it is a part"
 
         if self._within_a_row(index, new):
-            return "a force that acts less than half a row late is a matter of its course between the rows"
+            return "by so little of a row a held force and one on lines between the rows differ"
 
         if self._beyond_band(index, new):
             return "its ripple is beyond the band of the filter at nearly all speeds of the log"
@@ -308,7 +308,7 @@ class Acceptance:
         effects = machine.with_estimate(new).plant.effects
         added = {f.effect for f in (machine.parameters.free[i] for i in index) if f.effect is not None}
         delays = [float(effects[k].command_delay()) for k in added]
-        return 0.0 < max(delays, default=0.0) < 0.5 * self.data.period
+        return any(0.0 < delay < 0.5 * self.data.period for delay in delays)
 
     def _beyond_band(self, index: np.ndarray, new: np.ndarray) -> bool:
         """Check for an added ripple over the position that the filter removes nearly everywhere."""

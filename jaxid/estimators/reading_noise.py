@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxid.estimators.common.joint_weights import joint_weights
 from jaxid.estimators.estimate import Estimate
@@ -38,7 +38,7 @@ _UNCERTAIN = 0.1
 _MOST = 1.0 / (1.0 + 2 * _UNCERTAIN)
 # Eigenvalue of the scaled normal matrix, over the largest, below which a direction is not identifiable.
 _BLIND = 1e-10
-# Most steps, and the last one in standard deviations.
+# Largest number of steps, and size of a last step in standard deviations.
 _STEPS, _SMALL = 4, 0.05
 
 
@@ -66,6 +66,12 @@ class _Noisy:
             self.bias + other.bias,
         )
 
+    def without(self, fixed: Bool[np.ndarray, " p"]) -> _Noisy:
+        """Return the equations without some unknowns, whose rows and columns are zero."""
+        free = (~fixed).astype(np.float64)
+        both = np.outer(free, free)
+        return _Noisy(self.normal * both, self.gradient * free, self.of_noise * both, self.bias * free)
+
 
 @dataclass(frozen=True)
 class _Solution:
@@ -77,7 +83,7 @@ class _Solution:
         slope: Change of the step with the variance of the noise, over that variance, (p,).
         matrix: Normal matrix without noise; zero in directions that noise dominates, (p, p).
         hidden: Directions that noise dominates, (p, k).
-        share: Part of noise in the information of the direction that has most of it.
+        share: Part of noise in the information of the direction that has most of it, at most one.
     """
 
     step: Float[np.ndarray, " p"]
@@ -88,8 +94,17 @@ class _Solution:
     share: float
 
     @classmethod
-    def of(cls, sums: _Noisy) -> _Solution:
-        """Solve the equations in the directions that the log shows beyond its noise."""
+    def of(cls, sums: _Noisy, fixed: Bool[np.ndarray, " p"] | None = None) -> _Solution:
+        """Solve the equations in the directions that the log shows beyond its noise.
+
+        Args:
+            sums: The equations.
+            fixed: Unknowns that stay where they are, at a bound, (p,); None: all may move.
+        """
+        if fixed is not None and fixed.any():
+            inside = cls.of(sums.without(fixed))
+            moves = {"step": inside.step, "least_squares": inside.least_squares, "slope": inside.slope}
+            return replace(cls.of(sums), **moves)
         size = np.sqrt(np.maximum(np.diag(sums.normal), 1e-300))
         normal, noise = (x / np.outer(size, size) for x in (sums.normal, sums.of_noise))
         values, vectors = np.linalg.eigh(normal)
@@ -110,7 +125,7 @@ class _Solution:
             slope=(step(1.0 + _UNCERTAIN) - step(1.0 - _UNCERTAIN)) / (2 * _UNCERTAIN),
             matrix=(back * np.where(clear, 1.0 - share, 0.0)) @ back.T * np.outer(size, size),
             hidden=out[:, ~clear] / size[:, None],
-            share=float(share.max(initial=0.0)),
+            share=min(float(share.max(initial=0.0)), 1.0),
         )
 
 
@@ -235,7 +250,7 @@ def without_reading_noise(session: Session, estimate: Estimate) -> Steps[Estimat
     # A coefficient that noise took to its bound may have taken others anywhere.
     if np.any((theta <= lower) | (theta >= upper) | ~estimate.identifiable):
         theta = machine.parameters.guess
-    solution = yield from _solved(logs, theta)
+    solution = yield from _solved(machine, logs, theta)
     if solution is None:
         return estimate
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -246,8 +261,11 @@ def without_reading_noise(session: Session, estimate: Estimate) -> Steps[Estimat
     return (yield from _corrected(machine, estimate, logs, theta, solution))
 
 
-def _solved(logs: Sequence[_Log], theta: np.ndarray) -> Steps[_Solution | None]:
-    """Return the solution of the equations of all logs; None if they are not finite."""
+def _solved(machine: Machine, logs: Sequence[_Log], theta: np.ndarray) -> Steps[_Solution | None]:
+    """Return the solution of the equations of all logs; None if they are not finite.
+
+    An unknown at a bound beyond which its step goes stays there, and the others are solved with it.
+    """
     sums: _Noisy | None = None
     for log in logs:
         more = yield from log.sums(theta)
@@ -255,7 +273,10 @@ def _solved(logs: Sequence[_Log], theta: np.ndarray) -> Steps[_Solution | None]:
     assert sums is not None, "there is at least one log"
     if not all(np.all(np.isfinite(x)) for x in (sums.normal, sums.of_noise, sums.bias)):
         return None
-    return _Solution.of(sums)
+    lower, upper = machine.parameters.bounds
+    free = _Solution.of(sums)
+    beyond = ((theta <= lower) & (free.step < 0)) | ((theta >= upper) & (free.step > 0))
+    return _Solution.of(sums, beyond) if beyond.any() else free
 
 
 @dataclass(frozen=True)
@@ -296,7 +317,7 @@ def _corrected(
     found: _Found | None = None
     for _ in range(_STEPS):
         theta = np.clip(theta + solution.step, *machine.parameters.bounds)
-        again = yield from _solved(logs, theta)
+        again = yield from _solved(machine, logs, theta)
         if again is None:
             return estimate
         solution = again
@@ -320,20 +341,22 @@ def _corrected(
         message="converged",
         residual=np.concatenate(residual),
         std_misspecified=std_under_misspecification(*_stacked(found.rows)) * found.ratio,
-        notes=(*estimate.notes, _words(logs[0].part.log, found.precision, solution.share)),
+        notes=(*estimate.notes, _words(logs[0].part.log, solution)),
         details={**estimate.details, "reading_noise": {"share": solution.share}},
     )
 
 
-def _words(log: Log, precision: Precision, share: float) -> str:
+def _words(log: Log, solution: _Solution) -> str:
     """Return the note on what was removed, and on what noise hides."""
     quantity = "velocity" if log.integrated else "position"
     note = f"the bias by the noise of the measured {quantity} was removed"
-    if precision.identifiable.all():
-        return f"{note}: of one combination of the unknowns, {100 * share:.2g} % of the information is noise"
+    if not solution.hidden.shape[1]:
+        share = 100 * solution.share
+        return f"{note}: noise is {share:.2g} % of the information on a combination of the unknowns"
+    other = "" if log.integrated else "; instrumental_variable may"
     return (
         f"{note}, and unknowns of which noise makes up the information count as not identifiable: a faster "
-        "log, finer encoders, or faster motion would show them; instrumental_variable may"
+        f"log, finer encoders, or faster motion would show them{other}"
     )
 
 
@@ -357,23 +380,38 @@ def _precision(
         found = found.widened(widening(plain, jacobian, e, counts, [len(row.residual) for row in rows]))
     by_noise = _UNCERTAIN * solution.slope
     found = replace(found, covariance=found.covariance + np.outer(by_noise, by_noise))
-    found = _without_hidden(found, names, theta, solution.hidden)
+    found = _without_hidden(found, plain, names, theta, solution.hidden)
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = found.std / plain.std
     return found, np.where(np.isfinite(ratio), ratio, 1.0)
 
 
 def _without_hidden(
-    precision: Precision, names: list[str], theta: np.ndarray, hidden: Float[np.ndarray, "p k"]
+    precision: Precision,
+    plain: Precision,
+    names: list[str],
+    theta: np.ndarray,
+    hidden: Float[np.ndarray, "p k"],
 ) -> Precision:
     """Return the precision without the unknowns that noise hides.
 
     Along a hidden direction any value is possible. It hides an unknown that it moves by a part of its
     standard deviation, until one of the unknowns is twice its value.
+
+    Args:
+        precision: Precision without noise.
+        plain: Precision of least squares, with the directions that no log of these motions would show.
+        names: Names of the unknowns.
+        theta: Their values, (p,).
+        hidden: Hidden directions, (p, k).
     """
-    unidentifiable = []
+    if not hidden.shape[1]:
+        return replace(precision, unidentifiable=plain.unidentifiable)
+    # A value that is zero within its deviation has the size of that.
+    size = np.maximum(np.abs(theta), np.nan_to_num(plain.std))
+    unidentifiable = [*plain.unidentifiable]
     for direction in hidden.T:
-        relative = direction / np.where(theta == 0, np.inf, theta)
+        relative = np.divide(direction, size, out=np.zeros_like(direction), where=size > 0)
         most = float(np.max(np.abs(relative)))
         moved = np.abs(direction) / (most or 1.0)
         held = ~precision.identifiable | (moved > _MATTERS * precision.std)
@@ -382,7 +420,7 @@ def _without_hidden(
         precision = replace(precision, covariance=covariance, identifiable=seen)
         weights = relative / (np.linalg.norm(relative) or 1.0)
         unidentifiable.append({n: float(w) for n, w, h in zip(names, weights, held, strict=True) if h and w})
-    return replace(precision, unidentifiable=unidentifiable) if unidentifiable else precision
+    return replace(precision, unidentifiable=unidentifiable)
 
 
 def _stacked(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

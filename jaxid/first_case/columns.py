@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from jaxid.errors import InputError
 from jaxid.first_case.balance import has_direction
-from jaxid.first_case.two_encoders import without_load
+from jaxid.first_case.two_encoders import TwoEncoders, without_load
 from jaxid.first_case.words import FORCES, Meaning, meaning_of_joint
 from jaxid.logs.log import MINIMUM_SAMPLES
 from jaxid.logs.readers.dialect import split_unit
@@ -188,7 +188,9 @@ def choose(columns: Sequence[Column], where: str, *, of_robot: bool = False) -> 
     rest = [c for c in columns if c is not time and c.meaning.quantity not in ("time", "passed over")]
     if not any(c.meaning.quantity in ("position", "velocity") for c in rest):
         rest = _named_by_unit(rest)
-    rest, load = (rest, None) if of_robot else without_load(rest)
+    split = TwoEncoders(rest, None) if of_robot else without_load(rest)
+    rest = split.columns
+    said += [f"'{c.name}' is not used: it is of the load behind the coupling" for c in split.left_out]
 
     position, spare = _by_joint(rest, "position")
     velocity, _ = _by_joint(rest, "velocity")
@@ -214,7 +216,7 @@ def choose(columns: Sequence[Column], where: str, *, of_robot: bool = False) -> 
         force=tuple(force.values()),
         reference=tuple(reference.values()),
         loose_forces=loose_forces,
-        load=load,
+        load=split.load,
         joints=joints,
         said=tuple(said),
         questions=questions,

@@ -405,7 +405,8 @@ class Draft:
     def _empty(self) -> bool:
         """Check for values that are NaN in a log whose format has no empty cells."""
         chosen = self._chosen
-        used = [*chosen.position, *chosen.velocity, *chosen.force, *chosen.reference]
+        load = [] if chosen.load is None else [chosen.load]
+        used = [*chosen.position, *load, *chosen.velocity, *chosen.force, *chosen.reference]
         nan = any(np.isnan(self._raw.data[c.name]).any() for c in used)
         return nan and not self._raw.sparse and chosen.time is not None
 

@@ -16,6 +16,14 @@ from jaxid.first_case.two_encoders import ratio_of_strokes
 _RESONANCE, _DAMPED = 20.0, 0.05
 # Ratio of the strokes of motor and load from which there is a gear; within so much of a whole one it is that.
 _GEARED, _WHOLE = 1.1, 2e-3
+# Ratios of two units of one quantity, which a ratio of strokes within so much of them may be.
+_UNITS = {
+    180.0 / np.pi: "deg beside rad",
+    1e3: "mm beside m",
+    2 * np.pi: "rad beside turns",
+    360.0: "deg beside turns",
+}
+_NEAR = 5e-3
 
 
 class FlexibleDraft(Draft):
@@ -107,11 +115,29 @@ class FlexibleDraft(Draft):
         if not labelled:
             question = "is the force that of the motor? If it is that behind the gear, gain = 1.0"
             drive.questions.append(question)
+        near = next((name for unit, name in _UNITS.items() if abs(slope / unit - 1) < _NEAR), "")
+        if near:
+            drive.questions.append(f"or are the units of the two positions not the same ({near})?")
         reference = self._chosen.reference
-        if reference and np.ptp(reference[0].values) < 0.5 * np.ptp(motor.values):
+        if reference and self._of_load_side(reference[0], motor, ratio):
             del table.keys["reference"]
+            table.keys.get("units", {}).pop("reference", None)
+            table.offers.clear()
             table.assumed.append(f"'{reference[0].name}' is not used: it moves as far as the load")
         return drive
+
+    def _of_load_side(self, reference: Column, motor: Column, ratio: float) -> bool:
+        """Check that a reference moves as far as the load, and not as its motor."""
+        stroke = float(np.ptp(reference.values)) * self._factor("reference")
+        return stroke < float(np.ptp(motor.values)) * self._factor("position") / np.sqrt(ratio)
+
+    def without_force(self) -> list[Section]:
+        """Return the case of a log without a force, which leaves the load's encoder out."""
+        sections = super().without_force()
+        sections[-1].assumed.append(
+            f"'{self._load.name}' is not used: a log without a force has one position for a joint"
+        )
+        return sections
 
     def _motor_alone(self) -> list[Section]:
         """Return the case of the motor alone, with what to state for one of both."""

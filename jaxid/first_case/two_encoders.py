@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaxid.first_case.words import parts_of
+from jaxid.first_case.words import FORCES, parts_of
 from jaxid.logs.rough_inertia import Signal, correlation, smooth, windows
 
 if TYPE_CHECKING:
     from jaxid.first_case.columns import Column
 
-# Words that name the encoder of a load, those that do so alone, and those that name the encoder of its motor.
-_SURELY_LOAD = frozenset("load last link output abtrieb secondary".split())
-_OF_LOAD = _SURELY_LOAD | frozenset("l joint gelenk arm".split())
-_OF_MOTOR = frozenset("motor mot m rotor input primary".split())
+# Words that name the encoder of a load by themselves, and beside a word that names that of its motor.
+_OF_LOAD = frozenset("load link abtrieb secondary".split())
+_BESIDE_MOTOR = frozenset("l joint gelenk arm output".split())
+_OF_MOTOR = frozenset("motor mot m rotor primary".split())
+_MOTION = ("position", "velocity", "acceleration")
 # Correlation of the two positions from which they have one course.
 _SAME_COURSE = 0.95
 # Velocity below which a sample counts as at rest, over the largest one.
@@ -25,30 +26,55 @@ _REST = 0.02
 _ENOUGH = 20
 
 
-def without_load(columns: Sequence[Column]) -> tuple[list[Column], Column | None]:
-    """Split off the motion of a load behind a coupling, of which motor and load have an encoder each.
+class TwoEncoders(NamedTuple):
+    """The columns of a log without those of a load behind a coupling.
 
-    One of two positions of the same course is that of the load by its name, such as q_load beside q_motor.
+    Args:
+        columns: The other columns.
+        load: Position of the load; None: there is none, and the columns are all of the log.
+        left_out: Further columns of the load: other motion, and the torque behind the coupling.
+    """
+
+    columns: list[Column]
+    load: Column | None
+    left_out: tuple[Column, ...] = ()
+
+
+def without_load(columns: Sequence[Column]) -> TwoEncoders:
+    """Split off the columns of a load behind a coupling, of which motor and load have an encoder each.
+
+    One of two positions of the same course is that of the load by a word that the other name lacks, such as
+    q_load beside q_motor.
 
     Args:
         columns: The columns of a log.
-
-    Returns:
-        The columns without velocity and position of the load, and its position; None if there is none.
     """
-    words_of = lambda column: {*parts_of(column.name), *column.meaning.joint}
     measured = [c for c in columns if c.meaning.quantity == "position" and not c.meaning.reference]
     if len(measured) != 2:
-        return [*columns], None
+        return TwoEncoders([*columns], None)
     for motor, load in (measured, measured[::-1]):
-        of_motor, of_load = words_of(motor) & _OF_MOTOR, words_of(load) & _OF_LOAD
-        named = of_load & _SURELY_LOAD or (of_load and of_motor)
-        named = named and not words_of(motor) & _SURELY_LOAD
-        if named and correlation(motor.values, load.values) > _SAME_COURSE:
-            moving = ("position", "velocity", "acceleration")
-            beside = [c for c in columns if words_of(c) & of_load and c.meaning.quantity in moving]
-            return [c for c in columns if not any(c is b for b in beside)], load
-    return [*columns], None
+        of_motor, of_load = _words(motor) - _words(load), _words(load) - _words(motor)
+        beside = of_load & _BESIDE_MOTOR if of_motor & _OF_MOTOR else frozenset()
+        words = of_load & _OF_LOAD | beside
+        if not words or of_motor & _OF_LOAD or correlation(motor.values, load.values) <= _SAME_COURSE:
+            continue
+        others = [c for c in columns if c is not motor and c is not load]
+        of_it = [c for c in others if _words(c) & words and not _words(c) & _OF_MOTOR]
+        moving = [c for c in of_it if c.meaning.quantity in _MOTION]
+        forces = [c for c in of_it if c.meaning.quantity in FORCES]
+        if all(any(c is f for f in forces) for c in others if c.meaning.quantity in FORCES):
+            forces = []  # it is the only one
+        left_out = (*moving, *forces)
+        kept = [c for c in columns if c is not load and not any(c is x for x in left_out)]
+        return TwoEncoders(kept, load, left_out)
+    return TwoEncoders([*columns], None)
+
+
+def _words(column: Column) -> frozenset[str]:
+    """Return the words of a column's name; the German Last in front of another word is a load."""
+    parts = parts_of(column.name)
+    german = {"load"} if any(part.startswith("last") and part != "last" for part in parts) else set()
+    return frozenset({*parts, *german})
 
 
 def ratio_of_strokes(motor: Signal, load: Signal) -> float:

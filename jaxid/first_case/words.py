@@ -75,8 +75,8 @@ _DERIVATIVES = {
     for symbol in (*_SYMBOLS, "q")
     for pattern, order in (("d{}", 1), ("{}dot", 1), ("dd{}", 2), ("{}ddot", 2), ("{}dd", 2))
 }
-# Quantities along an axis, as in vx or Fz.
-_ALONG = {f"{q}{axis}": (_MEANING[q], axis) for q in "vf" for axis in "xyz"}
+# Velocities along an axis. A force along one is mostly that of a sensor between tool and workpiece.
+_ALONG = {f"v{axis}": axis for axis in "xyz"}
 _ROLE = {word: role for role, words in _ROLES.items() for word in words.split()}
 _SILENT = frozenset(_NOISE.split())
 # Words long enough to be parts of others, as in Lageistwert or TorqueActualValue, longest first.
@@ -169,9 +169,8 @@ class _Words:
             self.symbol = self.symbol or symbol
             self.words.append(symbol)
         elif word in _ALONG:
-            quantity, axis = _ALONG[word]
-            self.quantities.append(quantity)
-            self.symbol = self.symbol or axis
+            self.quantities.append("velocity")
+            self.symbol = self.symbol or _ALONG[word]
             self.words.append(word)
         elif word in _SYMBOLS:
             self.symbol = self.symbol or word
@@ -214,6 +213,8 @@ class _Words:
         if moved and "load" in quantities:
             # The position of a load is no load.
             quantities, joint = moved, [*joint, "load"]
+        if "link" in joint and {*quantities} & {"voltage", "command"}:
+            quantities = ["passed over"]  # that of an intermediate circuit
         quantity, order = _one(quantities), self.derivatives
         if self.leading and quantity in _MOTION:
             order += len(self.leading)

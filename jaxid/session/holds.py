@@ -81,7 +81,8 @@ def session_of_faster_loop(session: Session, machine: Machine) -> Session | None
     if not chosen or run.log.passive or session.more or "tick" in session.settings:
         return None
     lines = under_hold("linear", run, replace(machine, hold="linear"))
-    at_fit, fast = lines.machine(machine), loop_is_faster(run.machine(machine), run.log, likely=True)
+    at_fit = lines.machine(machine)
+    fast = loop_is_faster(at_fit, run.log, likely=run.log.hold == "linear")
     tick = faster_tick(at_fit, lines.log, lines.data, balance_fits(at_fit, lines.data)[0], fast=fast)
     if tick is None or tick.period >= run.log.period:
         return None

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.first_case.columns import choose, columns_of
 from jaxid.first_case.two_encoders import ratio_of_strokes
 from tests.estimators.test_reading_noise import SOFT, deviations
 from truth.chain.flexible_joints import flexible_joint
@@ -42,6 +43,17 @@ def test_two_joints_of_a_robot_are_no_motor_and_load(log):
     table = {name: log[of] for name, of in names.items()} | {"t": log["t"]}
     case = jaxid.init({**table, "link1_torque": log["torque"], "link2_torque": 0.5 * log["torque"]})
     assert case.tables["plant"]["kind"] == "axis"
+
+
+def test_joints_of_a_robots_file_are_no_motor_and_load(log):
+    columns = columns_of(
+        {name: log[name][:, None] for name in ("t", "q_motor", "q_load", "torque")},
+        {},
+        "t",
+        ("motor", "load"),
+    )
+    assert choose(columns, "log", of_robot=True).load is None
+    assert choose(columns, "log").load is not None
 
 
 def test_the_case_of_two_encoders_finds_the_truth(log):

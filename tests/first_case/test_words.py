@@ -67,7 +67,7 @@ NAMES = {
     "tau_d": "torque wanted",
     "xdd": "acceleration",
     "vx": "velocity",
-    "Fx": "force",
+    "link_voltage": "passed over of link",
     # motor and load
     "theta_load": "position of load",
     "link_pos": "position of link",

@@ -20,9 +20,6 @@ from jaxid.numerics.kept import kept_jit
 
 # Rows before a joint leaves, of which the largest force counts.
 _BEFORE = 3
-# Part of a level above sliding friction that the force of the median start must reach: a joint is seen to
-# leave its rest a little late, when the force has grown further.
-_REACHED = 1.0
 
 
 def was_held(machine: Machine, data: Prepared, found: BreakAway, joint: int) -> bool:
@@ -46,7 +43,8 @@ def was_held(machine: Machine, data: Prepared, found: BreakAway, joint: int) -> 
         for e in machine.plant.effects
         if e.sliding_level is not None and e.port == joint
     )
-    return bool(np.median(forces) > sliding + _REACHED * found.level)
+    # A joint is seen to leave its rest a little late, when the force has grown further.
+    return bool(np.median(forces) > sliding + found.level)
 
 
 def force_at_rest(
