@@ -262,7 +262,9 @@ def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.
     rate = log.rate_hz / data.recipe.decimation
     top = data.recipe.edge * log.rate_hz / 2 if data.recipe.edge else data.recipe.band_hz(log.rate_hz)
     top = min(top, 0.5 * rate)
-    f_all, of_position = position_density(_at(machine, fit, values), log, data)
+    # Guesses may be too large, and noise makes the values of a fit too small: the higher bound counts.
+    f_all, at_guesses = position_density(machine, log, data)
+    of_position = np.minimum(at_guesses, position_density(_at(machine, fit, values), log, data)[1])
     for k, joint in enumerate(machine.plant.driven(machine.plant.joints)):
         j = int(joint)
         f, power = _periodogram(residual[:, j], fit.counts[:, j], rate)

@@ -105,7 +105,8 @@ class _Solution:
             inside = cls.of(sums.without(fixed))
             moves = {"step": inside.step, "least_squares": inside.least_squares, "slope": inside.slope}
             return replace(cls.of(sums), **moves)
-        size = np.sqrt(np.maximum(np.diag(sums.normal), 1e-300))
+        squares = np.diag(sums.normal)
+        size = np.sqrt(np.where(squares > 0, squares, 1.0))
         normal, noise = (x / np.outer(size, size) for x in (sums.normal, sums.of_noise))
         values, vectors = np.linalg.eigh(normal)
         seen = values > _BLIND * values[-1]
@@ -248,7 +249,7 @@ def without_reading_noise(session: Session, estimate: Estimate) -> Steps[Estimat
 
     theta, lower, upper = np.asarray(estimate.theta), *machine.parameters.bounds
     # A coefficient that noise took to its bound may have taken others anywhere.
-    if np.any((theta <= lower) | (theta >= upper) | ~estimate.identifiable):
+    if np.any((theta <= lower) | (theta >= upper)):
         theta = machine.parameters.guess
     solution = yield from _solved(machine, logs, theta)
     if solution is None:
@@ -324,7 +325,7 @@ def _corrected(
         found = yield from _Found.steps(machine, logs, theta, solution)
         if found.converged:
             break
-    if found is None or not found.converged:
+    if found is None or not found.converged or not np.all(np.isfinite(theta)):
         # Unknowns in which the balance is far from linear keep the values of least squares.
         return estimate
 
@@ -369,7 +370,8 @@ def _precision(
     counts as one more error.
     """
     jacobian, e, counts = _stacked(rows)
-    norm = np.sqrt(np.maximum(np.sum(jacobian**2, axis=(0, 1)), 1e-300))
+    squares = np.sum(jacobian**2, axis=(0, 1))
+    norm = np.sqrt(np.where(squares > 0, squares, 1.0))
     matrices = [row.matrices(norm) for row in rows]
     normal, meat = (np.sum([pair[k] for pair in matrices], axis=0) for k in (0, 1))
     signal = float(np.sqrt(sum(row.signal**2 for row in rows)))

@@ -121,6 +121,12 @@ def test_what_was_missing_had_hidden_the_tick():
     assert other.fit.log.hold == "linear"
     assert "tick" in other.settings
     assert session_of_faster_loop(other, machine) is None
+    # Nor is a loop of the log's rate taken for a faster one.
+    every = robot_joint(4)[0].run()
+    of_rate = {"t": every["t"], "q": every["position"], "u": every["force"]}
+    declared = open_session(tables, of_rate, align_hold=True, method="discover")
+    fitted = jaxid.identify(tables, of_rate, method="inverse_dynamics").estimate.machine
+    assert session_of_faster_loop(declared, fitted) is None
     # A hold that the case states stays.
     assert session_of_faster_loop(replace(session, chooses_hold=False), machine) is None
 

@@ -7,7 +7,7 @@ from jaxid.estimators import METHODS
 from jaxid.estimators.inverse_dynamics import inverse_dynamics
 from jaxid.numerics.lanes import run_alone
 from jaxid.session import open_session
-from truth.chain.flexible_joints import case, flexible_joint
+from truth.chain.flexible_joints import FlexibleJoint, case, flexible_joint
 
 # Its resonance lies at 23 Hz, and least squares finds 2/3 of the stiffness, 3 deviations off; that of the
 # other one at 37 Hz, whose elongation the encoders do not show at 200 Hz.
@@ -70,3 +70,36 @@ def test_exact_readings_are_left_alone():
     fit = run_alone(METHODS["inverse_dynamics"](session))
     assert "reading_noise" not in fit.details
     np.testing.assert_array_equal(fit.theta, plain.theta)
+
+
+def with_a_second_friction(seed: int):
+    """Fit a joint of which two unknowns cannot be told apart by any log."""
+    tables = case()
+    twice = {"kind": "viscous_friction", "joint": 1, "coefficient": {"guess": 0.1}}
+    tables["effects"] = [*tables["effects"], twice]
+    session = open_session(tables, flexible_joint(seed).log(200.0))
+    return run_alone(METHODS["inverse_dynamics"](session))
+
+
+def test_unknowns_that_no_log_tells_apart_are_not_hidden_by_noise():
+    fit = with_a_second_friction(SOFT)
+    assert fit.details["reading_noise"]["share"] < 0.5
+    assert [len(c) for c in fit.precision.unidentifiable] == [2]
+    assert not any("noise makes up" in note for note in fit.notes)
+
+
+def test_what_noise_hides_stands_beside_what_no_log_tells_apart():
+    fit = with_a_second_friction(STIFF)
+    assert len(fit.precision.unidentifiable) == 2
+    assert {"load_inertia", "stiffness"} <= {*fit.precision.unidentifiable[-1]}
+
+
+def test_a_value_at_its_bound_stays_there_while_others_are_corrected():
+    """A load without dry friction, whose level is at zero: the stiffness loses its bias all the same."""
+    joint = flexible_joint(SOFT)
+    bare = FlexibleJoint(SOFT, joint.true | {"coulomb_friction[2].level": 1e-6})
+    session = open_session(case(), bare.log(200.0))
+    fit = run_alone(METHODS["inverse_dynamics"](session))
+    z = (fit.value("stiffness") - bare.true["stiffness"]) / fit.std[fit.names.index("stiffness")]
+    assert fit.details["reading_noise"]["share"] > 0.05
+    assert abs(z) < 2.5

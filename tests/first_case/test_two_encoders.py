@@ -27,6 +27,7 @@ def log():
         ("primary_encoder", "secondary_encoder"),
         ("Motorposition", "Lastposition"),
         ("theta", "theta_load"),
+        ("q_joint_motor", "q_joint_load"),
     ],
 )
 def test_names_of_two_encoders_are_read(log, motor, load):
@@ -37,12 +38,55 @@ def test_names_of_two_encoders_are_read(log, motor, load):
     assert any(load in line and "coupling" in line for line in case.assumed)
 
 
-def test_two_joints_of_a_robot_are_no_motor_and_load(log):
-    """They may move together, and the first link has the word link in its name as well."""
-    names = {"link1_pos": "q_motor", "link2_pos": "q_load"}
-    table = {name: log[of] for name, of in names.items()} | {"t": log["t"]}
-    case = jaxid.init({**table, "link1_torque": log["torque"], "link2_torque": 0.5 * log["torque"]})
-    assert case.tables["plant"]["kind"] == "axis"
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("link1_pos", "link2_pos"),
+        ("joint1_pos_m", "joint2_pos_m"),
+        ("finger_joint1 pos [m]", "finger_joint2 pos [m]"),
+        ("motor_left_arm_pos", "motor_right_arm_pos"),
+        ("pos", "last_pos"),
+        ("angle", "angle_output"),
+    ],
+)
+def test_two_positions_that_move_together_need_not_be_motor_and_load(log, one, other):
+    table = {"t": log["t"], one: log["q_motor"], other: log["q_load"]}
+    columns = columns_of({name: x[:, None] for name, x in table.items()}, {}, "t")
+    assert choose(columns, "log").load is None
+
+
+@pytest.mark.parametrize(("behind", "force"), [("tau_link", "tau_motor"), ("link_torque", "current")])
+def test_a_torque_behind_the_coupling_is_not_that_of_the_motor(log, behind, force):
+    columns = {behind: 0.5 * log["torque"], force: log["torque"]}
+    case = jaxid.init({"t": log["t"], "q_motor": log["q_motor"], "q_link": log["q_load"], **columns})
+    assert case.tables["log"]["force"] == force
+    assert any(f"'{behind}' is not used" in line for line in case.assumed)
+
+
+def test_a_log_without_a_force_says_that_it_leaves_the_load_out(log):
+    table = {"t": log["t"], "q_motor": log["q_motor"], "q_load": log["q_load"], "q_ref": log["q_motor"]}
+    case = jaxid.init(table)
+    assert any("'q_load' is not used: a log without a force" in line for line in case.assumed)
+
+
+def test_a_missing_reading_of_the_load_is_resampled(log):
+    load = log["q_load"].copy()
+    load[500] = np.nan
+    case = jaxid.init({"t": log["t"], "q_motor": log["q_motor"], "q_load": load, "torque": log["torque"]})
+    assert case.tables["log"]["resample"] == pytest.approx(1000.0)
+
+
+def test_a_reference_of_the_load_is_left_out_behind_a_gear(log):
+    table = {
+        "t": log["t"],
+        "motor pos [deg]": np.rad2deg(50 * log["q_motor"]),
+        "load pos [deg]": np.rad2deg(log["q_load"]),
+        "pos ref [deg]": np.rad2deg(log["q_load"]),
+        "torque [Nm]": log["torque"] / 50,
+    }
+    tables = jaxid.init(table).tables["log"]
+    assert "reference" not in tables
+    assert tables["units"] == {"position": "deg", "load_position": "deg", "force": "Nm"}
 
 
 def test_joints_of_a_robots_file_are_no_motor_and_load(log):
