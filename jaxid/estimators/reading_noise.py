@@ -7,6 +7,8 @@ encoders may be noise for the most part.
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,6 +18,7 @@ from jaxtyping import Bool, Float
 from jaxid.estimators.common.joint_weights import joint_weights
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.several.parts import Part, parts_of
+from jaxid.estimators.several.sums import stacked
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import motion
 from jaxid.machine import Machine
@@ -188,33 +191,31 @@ class _Log:
         places, values = part.machine.parameters.places, theta[part.index]
         return SolveRequest(force_and_columns, (plant, places, arrays, values))
 
-    def rows(self, found: tuple, width: int) -> tuple[np.ndarray, np.ndarray]:
+    def weighted(self, found: tuple, width: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the weighted residual and its Jacobian by all unknowns; zero for rows that do not count."""
         counts = self.part.data.fitted
         e = np.where(counts, np.asarray(found[0]) * self.weight, 0.0)
         columns = np.where(counts[..., None], np.asarray(found[1]) * self.weight[:, None], 0.0)
         return e, self.part.widened(columns, width)
 
-    def sums(self, theta: np.ndarray) -> Steps[_Noisy]:
-        """Return the sums of this log's equations, with what as much noise again adds to them.
+    def equations(self, theta: np.ndarray) -> Steps[tuple[Rows, _Noisy]]:
+        """Return the rows of this log, and their sums with what as much noise again adds to them.
 
         Pairs of opposite noise leave its product with itself alone.
         """
         p, rng = theta.size, np.random.default_rng(0)
-        e, columns = self.rows((yield self.request(theta)), p)
+        e, columns = self.weighted((yield self.request(theta)), p)
         flat = columns.reshape(-1, p)
         normal, gradient = flat.T @ flat, flat.T @ e.ravel()
         of_noise, bias = np.zeros_like(normal), np.zeros_like(gradient)
         for _ in range(self.pairs):
             drawn = self.noise * rng.standard_normal(self.part.log.position.shape)
-            pair = []
-            for sign in (0.5, -0.5):
-                pair.append(self.rows((yield self.request(theta, 2 * sign * drawn)), p))
-            (up, columns_up), (down, columns_down) = pair
+            up, columns_up = self.weighted((yield self.request(theta, drawn)), p)
+            down, columns_down = self.weighted((yield self.request(theta, -drawn)), p)
             flat = 0.5 * (columns_up - columns_down).reshape(-1, p)
             of_noise += flat.T @ flat / self.pairs
             bias += flat.T @ (0.5 * (up - down)).ravel() / self.pairs
-        return _Noisy(normal, gradient, of_noise, bias)
+        return Rows(columns, e, self.part.data.fitted, self.size), _Noisy(normal, gradient, of_noise, bias)
 
 
 def without_reading_noise(session: Session, estimate: Estimate) -> Steps[Estimate]:
@@ -251,99 +252,94 @@ def without_reading_noise(session: Session, estimate: Estimate) -> Steps[Estimat
     # A coefficient that noise took to its bound may have taken others anywhere.
     if np.any((theta <= lower) | (theta >= upper)):
         theta = machine.parameters.guess
-    solution = yield from _solved(machine, logs, theta)
-    if solution is None:
+    equations = yield from _Equations.steps(machine, logs, theta)
+    if equations is None:
         return estimate
+    solution = equations.solution
     with np.errstate(invalid="ignore", divide="ignore"):
         bias = (solution.least_squares - solution.step) / estimate.std
     largest = np.abs(np.where(np.isfinite(bias), bias, 0.0))
     if solution.share < _MOST and largest.max() < _MATTERS:
         return estimate
-    return (yield from _corrected(machine, estimate, logs, theta, solution))
-
-
-def _solved(machine: Machine, logs: Sequence[_Log], theta: np.ndarray) -> Steps[_Solution | None]:
-    """Return the solution of the equations of all logs; None if they are not finite.
-
-    An unknown at a bound beyond which its step goes stays there, and the others are solved with it.
-    """
-    sums: _Noisy | None = None
-    for log in logs:
-        more = yield from log.sums(theta)
-        sums = more if sums is None else sums + more
-    assert sums is not None, "there is at least one log"
-    if not all(np.all(np.isfinite(x)) for x in (sums.normal, sums.of_noise, sums.bias)):
-        return None
-    lower, upper = machine.parameters.bounds
-    free = _Solution.of(sums)
-    beyond = ((theta <= lower) & (free.step < 0)) | ((theta >= upper) & (free.step > 0))
-    return _Solution.of(sums, beyond) if beyond.any() else free
+    return (yield from _corrected(machine, estimate, logs, theta, equations))
 
 
 @dataclass(frozen=True)
-class _Found:
-    """Values of the unknowns without the bias by noise.
+class _Equations:
+    """Equations of all logs at values of the unknowns, with their solution.
 
     Args:
         rows: Residual and Jacobian of each log.
-        precision: Precision of the values.
-        ratio: Their standard deviations over those of least squares, (p,).
-        converged: Whether the next step is small.
+        solution: The solution without noise.
     """
 
     rows: list[Rows]
-    precision: Precision
-    ratio: Float[np.ndarray, " p"]
-    converged: bool
+    solution: _Solution
 
     @classmethod
-    def steps(
-        cls, machine: Machine, logs: Sequence[_Log], theta: np.ndarray, solution: _Solution
-    ) -> Steps[_Found]:
-        """Assess values of the unknowns, (p,), by the solution of the equations at them."""
-        rows = []
+    def steps(cls, machine: Machine, logs: Sequence[_Log], theta: np.ndarray) -> Steps[_Equations | None]:
+        """Compute and solve the equations; None if they are not finite.
+
+        An unknown at a bound beyond which its step goes stays there, and the others are solved with it.
+        """
+        rows, noisy = [], []
         for log in logs:
-            e, columns = log.rows((yield log.request(theta)), theta.size)
-            rows.append(Rows(columns, e, log.part.data.fitted, log.size))
-        precision, ratio = _precision(machine.parameters.names, theta, logs, rows, solution)
-        change = np.clip(theta + solution.step, *machine.parameters.bounds) - theta
-        far = precision.identifiable & (np.abs(change) > _SMALL * precision.std)
-        return cls(rows, precision, ratio, not np.any(far))
+            of_log, sums = yield from log.equations(theta)
+            rows.append(of_log)
+            noisy.append(sums)
+        sums = functools.reduce(operator.add, noisy)
+        if not all(np.all(np.isfinite(x)) for x in (sums.normal, sums.of_noise, sums.bias)):
+            return None
+        lower, upper = machine.parameters.bounds
+        free = _Solution.of(sums)
+        beyond = ((theta <= lower) & (free.step < 0)) | ((theta >= upper) & (free.step > 0))
+        return cls(rows, _Solution.of(sums, beyond) if beyond.any() else free)
 
 
 def _corrected(
-    machine: Machine, estimate: Estimate, logs: Sequence[_Log], theta: np.ndarray, solution: _Solution
+    machine: Machine, estimate: Estimate, logs: Sequence[_Log], theta: np.ndarray, start: _Equations
 ) -> Steps[Estimate]:
     """Step to the solution without noise, and return it with its precision."""
-    found: _Found | None = None
+    bounds, names, at = machine.parameters.bounds, machine.parameters.names, start
     for _ in range(_STEPS):
-        theta = np.clip(theta + solution.step, *machine.parameters.bounds)
-        again = yield from _solved(machine, logs, theta)
-        if again is None:
+        theta = np.clip(theta + at.solution.step, *bounds)
+        found = yield from _Equations.steps(machine, logs, theta)
+        if found is None:
             return estimate
-        solution = again
-        found = yield from _Found.steps(machine, logs, theta, solution)
-        if found.converged:
-            break
-    if found is None or not found.converged or not np.all(np.isfinite(theta)):
-        # Unknowns in which the balance is far from linear keep the values of least squares.
-        return estimate
+        at = found
+        precision, ratio = _precision(names, theta, logs, at)
+        change = np.clip(theta + at.solution.step, *bounds) - theta
+        if not np.any(precision.identifiable & (np.abs(change) > _SMALL * precision.std)):
+            return _without_bias(machine, estimate, logs, theta, at, precision, ratio)
+    # Unknowns in which the balance is far from linear keep the values of least squares.
+    return estimate
 
+
+def _without_bias(
+    machine: Machine,
+    estimate: Estimate,
+    logs: Sequence[_Log],
+    theta: np.ndarray,
+    at: _Equations,
+    precision: Precision,
+    ratio: Float[np.ndarray, " p"],
+) -> Estimate:
+    """Return the estimate with values that lost their bias, and the note on it."""
     residual = [
         np.where(row.counts, row.residual / log.weight, np.nan)
-        for row, log in zip(found.rows, logs, strict=True)
+        for row, log in zip(at.rows, logs, strict=True)
     ]
     return replace(
         estimate,
         theta=theta,
         machine=machine.with_estimate(theta),
-        precision=found.precision,
+        precision=precision,
         converged=True,
         message="converged",
         residual=np.concatenate(residual),
-        std_misspecified=std_under_misspecification(*_stacked(found.rows)) * found.ratio,
-        notes=(*estimate.notes, _words(logs[0].part.log, solution)),
-        details={**estimate.details, "reading_noise": {"share": solution.share}},
+        std_misspecified=std_under_misspecification(*stacked(at.rows)) * ratio,
+        notes=(*estimate.notes, _words(logs[0].part.log, at.solution)),
+        details={**estimate.details, "reading_noise": {"share": at.solution.share}},
     )
 
 
@@ -362,14 +358,15 @@ def _words(log: Log, solution: _Solution) -> str:
 
 
 def _precision(
-    names: list[str], theta: np.ndarray, logs: Sequence[_Log], rows: Sequence[Rows], solution: _Solution
+    names: list[str], theta: np.ndarray, logs: Sequence[_Log], at: _Equations
 ) -> tuple[Precision, Float[np.ndarray, " p"]]:
     """Return the precision of a solution without noise, and its deviations over those of least squares.
 
     Its normal matrix is smaller than that of least squares. The variance of the noise is uncertain, which
     counts as one more error.
     """
-    jacobian, e, counts = _stacked(rows)
+    rows, solution = at.rows, at.solution
+    jacobian, e, counts = stacked(rows)
     squares = np.sum(jacobian**2, axis=(0, 1))
     norm = np.sqrt(np.where(squares > 0, squares, 1.0))
     matrices = [row.matrices(norm) for row in rows]
@@ -423,12 +420,3 @@ def _without_hidden(
         weights = relative / (np.linalg.norm(relative) or 1.0)
         unidentifiable.append({n: float(w) for n, w, h in zip(names, weights, held, strict=True) if h and w})
     return replace(precision, unidentifiable=unidentifiable)
-
-
-def _stacked(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Jacobian, residual and mask of all logs, one behind the other."""
-    return (
-        np.concatenate([row.jacobian for row in rows]),
-        np.concatenate([row.residual for row in rows]),
-        np.concatenate([row.counts for row in rows]),
-    )

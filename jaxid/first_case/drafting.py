@@ -71,11 +71,7 @@ class Draft:
             rough = rough_balance(
                 force, motion, float(np.median(np.diff(time))), rotary=rotary, of_velocity=not chosen.position
             )
-        rough, signs = driven_balance(rough)
-        if signs:
-            table.keys["sign"] = {"force": -1}
-            table.assumed.append("the force as logged brakes the motion: its sign is turned")
-            table.questions.append("is a positive force one that drives a positive velocity?")
+        rough = driven_balance(rough, table)
         plant, effects = self._plant(rough), self._effects(rough)
         return [*plant, *effects, table, *self._sensor(log)]
 
@@ -434,10 +430,13 @@ class Draft:
         return even, np.interp(even, time, motion), np.interp(even, time, force)
 
 
-def driven_balance(rough: RoughBalance) -> tuple[RoughBalance, bool]:
-    """Return the balance with the force turned if it brakes as logged, and whether it was."""
+def driven_balance(rough: RoughBalance, table: Section) -> RoughBalance:
+    """Return the balance with the force turned if it brakes as logged, and say so in the table of the log."""
     if not rough.braked:
-        return _plausible(rough), False
+        return _plausible(rough)
+    table.keys["sign"] = {"force": -1}
+    table.assumed.append("the force as logged brakes the motion: its sign is turned")
+    table.questions.append("is a positive force one that drives a positive velocity?")
     weight = None if rough.weight is None else (-rough.weight[0], -rough.weight[1])
     turned = replace(
         rough,
@@ -448,7 +447,7 @@ def driven_balance(rough: RoughBalance) -> tuple[RoughBalance, bool]:
         weight=weight,
         spring=None if rough.spring is None else -rough.spring,
     )
-    return _plausible(turned), True
+    return _plausible(turned)
 
 
 def _plausible(rough: RoughBalance) -> RoughBalance:

@@ -52,11 +52,7 @@ class FlexibleDraft(Draft):
         log = self._read(table, drive)
         rotary = self._measures.motion == "rotary"
         rough = rough_balance(gain * log.force[:, 0], log.position[:, 0], log.period, rotary=rotary)
-        rough, turned = driven_balance(rough)
-        if turned:
-            table.keys["sign"] = {"force": -1}
-            table.assumed.append("the force as logged brakes the motion: its sign is turned")
-            table.questions.append("is a positive force one that drives a positive velocity?")
+        rough = driven_balance(rough, table)
 
         half, omega = 0.5 * rough.inertia, 2 * np.pi * _RESONANCE
         stiffness = omega**2 * 0.5 * half
@@ -73,8 +69,8 @@ class FlexibleDraft(Draft):
             "damping": 2 * _DAMPED * stiffness / omega,
         }
         keys: dict[str, Any] = {name: {"guess": rounded(value)} for name, value in guesses.items()}
-        load = log.load_position if log.load_position is not None else log.position
-        offset = float(np.median(load[:, 0] - log.position[:, 0]))
+        assert log.load_position is not None, "the table names its column"
+        offset = float(np.median(log.load_position[:, 0] - log.position[:, 0]))
         keys["zero_offset"] = {"guess": rounded(offset)}
         labels = {name: units.label("inertia") for name in ("motor_inertia", "load_inertia")}
         labels |= {"stiffness": units.label("force/position"), "damping": units.label("force*time/position")}

@@ -9,11 +9,11 @@ from jaxtyping import Float
 
 from jaxid.consistency.balance_fit import balance_fits
 from jaxid.consistency.hold import better_hold, hold_finding, hold_setting
-from jaxid.consistency.noise import ForceNoise, estimated_force_noise, loop_is_faster
-from jaxid.consistency.tick import Tick, faster_tick
+from jaxid.consistency.noise import estimated_force_noise, loop_is_faster
+from jaxid.consistency.tick import faster_tick
 from jaxid.machine import Machine
-from jaxid.session.opened import OpenedLog, Session
-from jaxid.session.preparing import under_hold
+from jaxid.session.opened import Session
+from jaxid.session.preparing import under_hold, with_force_noise
 
 
 def session_under_hold(session: Session, hold: str) -> Session:
@@ -91,21 +91,9 @@ def session_of_faster_loop(session: Session, machine: Machine) -> Session | None
     noise = estimated_force_noise(at_fit, held.fit.log, data, balance_fits(at_fit, data)[0], fast=True)
     return replace(
         held,
-        fit=_at_tick(held.fit, tick, noise),
-        validations=tuple(_at_tick(other, tick, noise) for other in held.validations),
+        fit=with_force_noise(held.fit, noise, tick.period),
+        validations=tuple(with_force_noise(other, noise, tick.period) for other in held.validations),
         findings=(*session.findings, tick.finding(run.log)),
         settings={**session.settings, "tick": tick.setting()},
         chooses_hold=False,
     )
-
-
-def _at_tick(run: OpenedLog, tick: Tick, noise: ForceNoise) -> OpenedLog:
-    """Return a log whose forces act for a tick, with their noise."""
-    data = replace(
-        run.data,
-        hold=tick.period,
-        force_noise=noise.std,
-        faster_loop=noise.faster_loop,
-        answer=noise.answer,
-    )
-    return replace(run, data=data)

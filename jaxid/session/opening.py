@@ -11,7 +11,6 @@ from jaxtyping import Bool
 
 from jaxid.build import build_machine
 from jaxid.case.case import Case, CaseLike, load_case
-from jaxid.consistency.noise import ForceNoise
 from jaxid.errors import InputError
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
@@ -29,6 +28,7 @@ from jaxid.session.preparing import (
     open_log,
     recipe_of,
     under_hold,
+    with_force_noise,
     with_velocity_scale,
     without_clipped,
 )
@@ -273,9 +273,8 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
     machine, opened, more = session.machine, [session.fit, *session.validations], list(session.more)
 
     # The logs to validate on are of the same sensors and the same loop.
-    opened = [_with_force_noise(run, found.force_noise) for run in opened]
+    opened = [with_force_noise(run, found.force_noise, found.held) for run in opened]
     if found.held is not None:
-        opened = [replace(run, data=replace(run.data, hold=found.held)) for run in opened]
         session = replace(session, chooses_hold=False)
     findings = [*session.findings, *found.findings]
     for k, run in enumerate(more):
@@ -284,9 +283,8 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
         findings += also.findings
         if also.clipped is not None:
             run = without_clipped(run, also.clipped, machine)
-        run = _with_force_noise(run, also.force_noise)
-        if found.held is not None and run.log.period == fit.log.period:
-            run = replace(run, data=replace(run.data, hold=found.held))
+        same_rate = run.log.period == fit.log.period
+        run = with_force_noise(run, also.force_noise, found.held if same_rate else None)
         other = None if also.reference_hold == machine.reference_hold else also.reference_hold
         more[k] = replace(run, reference_hold=run.reference_hold or other)
     return replace(
@@ -315,11 +313,6 @@ def _without_clipped(session: Session, rows: Bool[np.ndarray, "samples m"]) -> S
 
     validations = tuple(clean(run) for run in session.validations)
     return replace(session, fit=without_clipped(session.fit, rows, machine), validations=validations)
-
-
-def _with_force_noise(opened: OpenedLog, noise: ForceNoise) -> OpenedLog:
-    data = replace(opened.data, force_noise=noise.std, faster_loop=noise.faster_loop, answer=noise.answer)
-    return replace(opened, data=data)
 
 
 def _with_unknowns_by_log(case: Case, machine: Machine, sources: Sequence[Source]) -> Machine:

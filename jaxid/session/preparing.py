@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxid.case.case import Case
+from jaxid.consistency.noise import ForceNoise
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
@@ -40,6 +41,18 @@ def under_hold(hold: str, opened: OpenedLog, machine: Machine) -> OpenedLog:
     log = replace(opened.log, hold=hold)
     held = opened.data.recipe.hold(log, machine.hold_period)
     return replace(opened, log=log, data=replace(opened.data, hold=held))
+
+
+def with_force_noise(opened: OpenedLog, noise: ForceNoise, tick: float | None = None) -> OpenedLog:
+    """Return a log with the noise of its force.
+
+    Args:
+        opened: The log.
+        noise: The noise.
+        tick: Time for which each force acts [s]; None: as before.
+    """
+    data = replace(opened.data, force_noise=noise.std, faster_loop=noise.faster_loop, answer=noise.answer)
+    return replace(opened, data=data if tick is None else replace(data, hold=tick))
 
 
 def without_clipped(opened: OpenedLog, rows: Bool[np.ndarray, "samples m"], machine: Machine) -> OpenedLog:
