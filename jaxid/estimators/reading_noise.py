@@ -19,7 +19,6 @@ from jaxid.estimators.common.joint_weights import joint_weights
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.several.parts import Part, parts_of
 from jaxid.estimators.several.sums import stacked
-from jaxid.logs.log import Log
 from jaxid.logs.prepare import motion
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import SolveRequest, Steps
@@ -307,10 +306,10 @@ def _corrected(
         if found is None:
             return estimate
         at = found
-        precision, ratio = _precision(names, theta, logs, at)
+        plain, precision = _precision(names, theta, logs, at)
         change = np.clip(theta + at.solution.step, *bounds) - theta
         if not np.any(precision.identifiable & (np.abs(change) > _SMALL * precision.std)):
-            return _without_bias(machine, estimate, logs, theta, at, precision, ratio)
+            return _without_bias(machine, estimate, logs, theta, at, plain, precision)
     # Unknowns in which the balance is far from linear keep the values of least squares.
     return estimate
 
@@ -321,14 +320,35 @@ def _without_bias(
     logs: Sequence[_Log],
     theta: np.ndarray,
     at: _Equations,
+    plain: Precision,
     precision: Precision,
-    ratio: Float[np.ndarray, " p"],
 ) -> Estimate:
-    """Return the estimate with values that lost their bias, and the note on it."""
+    """Return the estimate with values that lost their bias, and the note on it.
+
+    Args:
+        machine: Machine of all logs.
+        estimate: Estimate by least squares.
+        logs: The logs.
+        theta: Values without bias, (p,).
+        at: Equations at these.
+        plain: Precision that least squares would have there.
+        precision: Precision of the values.
+    """
     residual = [
         np.where(row.counts, row.residual / log.weight, np.nan)
         for row, log in zip(at.rows, logs, strict=True)
     ]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = precision.std / plain.std
+    ratio = np.where(np.isfinite(ratio), ratio, 1.0)
+    masks = zip(estimate.names, plain.identifiable, precision.identifiable, strict=True)
+    hidden = [name for name, shown, kept in masks if shown and not kept]
+    quantity = "velocity" if logs[0].part.log.integrated else "position"
+    share = at.solution.share
+    note = (
+        f"the bias by the noise of the measured {quantity} was removed: noise is {100 * share:.2g} % of the "
+        "information on a combination of the unknowns"
+    )
     return replace(
         estimate,
         theta=theta,
@@ -338,31 +358,17 @@ def _without_bias(
         message="converged",
         residual=np.concatenate(residual),
         std_misspecified=std_under_misspecification(*stacked(at.rows)) * ratio,
-        notes=(*estimate.notes, _words(logs[0].part.log, at.solution)),
-        details={**estimate.details, "reading_noise": {"share": at.solution.share}},
-    )
-
-
-def _words(log: Log, solution: _Solution) -> str:
-    """Return the note on what was removed, and on what noise hides."""
-    quantity = "velocity" if log.integrated else "position"
-    note = f"the bias by the noise of the measured {quantity} was removed"
-    if not solution.hidden.shape[1]:
-        share = 100 * solution.share
-        return f"{note}: noise is {share:.2g} % of the information on a combination of the unknowns"
-    other = "" if log.integrated else "; instrumental_variable may"
-    return (
-        f"{note}, and unknowns of which noise makes up the information count as not identifiable: a faster "
-        f"log, finer encoders, or faster motion would show them{other}"
+        notes=(*estimate.notes, note),
+        details={**estimate.details, "reading_noise": {"share": share, "hidden": hidden}},
     )
 
 
 def _precision(
     names: list[str], theta: np.ndarray, logs: Sequence[_Log], at: _Equations
-) -> tuple[Precision, Float[np.ndarray, " p"]]:
-    """Return the precision of a solution without noise, and its deviations over those of least squares.
+) -> tuple[Precision, Precision]:
+    """Return the precision of least squares, and that of the solution without noise.
 
-    Its normal matrix is smaller than that of least squares. The variance of the noise is uncertain, which
+    The normal matrix of the second is smaller. The variance of the noise is uncertain, which
     counts as one more error.
     """
     rows, solution = at.rows, at.solution
@@ -379,10 +385,7 @@ def _precision(
         found = found.widened(widening(plain, jacobian, e, counts, [len(row.residual) for row in rows]))
     by_noise = _UNCERTAIN * solution.slope
     found = replace(found, covariance=found.covariance + np.outer(by_noise, by_noise))
-    found = _without_hidden(found, plain, names, theta, solution.hidden)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = found.std / plain.std
-    return found, np.where(np.isfinite(ratio), ratio, 1.0)
+    return plain, _without_hidden(found, plain, names, theta, solution.hidden)
 
 
 def _without_hidden(

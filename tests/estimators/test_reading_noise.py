@@ -46,7 +46,9 @@ def test_what_noise_hides_is_not_identifiable():
     )
     assert {"load_inertia", "stiffness"} <= {n for c in fit.estimate.precision.unidentifiable for n in c}
     assert fit.estimate.details["reading_noise"]["share"] > 0.8
-    assert "instrumental_variable" in " ".join(fit.estimate.notes)
+    assert {"load_inertia", "stiffness"} <= {*fit.estimate.details["reading_noise"]["hidden"]}
+    assert fit.findings[1].startswith("Noise of the readings hides motor_inertia, load_inertia, stiffness")
+    assert "instrumental_variable" in fit.findings[1]
 
 
 def test_two_logs_are_corrected_together():
@@ -85,7 +87,7 @@ def test_unknowns_that_no_log_tells_apart_are_not_hidden_by_noise():
     fit = with_a_second_friction(SOFT)
     assert fit.details["reading_noise"]["share"] < 0.5
     assert [len(c) for c in fit.precision.unidentifiable] == [2]
-    assert not any("noise makes up" in note for note in fit.notes)
+    assert fit.details["reading_noise"]["hidden"] == []
 
 
 def test_what_noise_hides_stands_beside_what_no_log_tells_apart():

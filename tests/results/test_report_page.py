@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from jaxid.results.effect_words import CONTROLLER, DRIVE, GEAR, LOAD, words_of
 from jaxid.results.report.build import discovery_data, identification_data
 from jaxid.results.report.data import LogView
 from jaxid.results.report.figure_tables import tables_of
-from jaxid.results.report.first_page import first_values
+from jaxid.results.report.first_page import completeness, first_values
 from jaxid.results.report.force_plots import plot_frictions
 from jaxid.results.report.page import render
 from jaxid.results.report.store import packed, unpacked
@@ -278,3 +279,10 @@ def test_both_commands_keep_their_reports_in_one_folder(fitted, found, tmp_path)
     assert title("report_discover.html") == "What is missing in bare"
     assert not (out / "report_identify.html").exists()
     assert {"result.npz", "discovery.npz", "result.json", "discovery.json"} <= {p.name for p in out.iterdir()}
+
+
+@pytest.mark.parametrize(("identified", "style"), [(True, "good"), (False, "open")])
+def test_no_badge_is_green_where_nothing_is_identified(identified, style):
+    shown = {"verdict": None, "model_complete": True, "findings": (), "explains": True}
+    data = SimpleNamespace(**shown, parameters=("inertia",), identified=identified)
+    assert completeness(data) == {"text": "model complete", "style": style}

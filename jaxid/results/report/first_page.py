@@ -76,6 +76,8 @@ def completeness(data: ReportData) -> dict | None:
     if data.model_complete is None and not data.findings:
         return None
     text, style = _MODEL[data.model_complete]
+    if data.parameters and not data.identified:
+        style = "open"
     return {"text": text, "style": style if data.explains else "bad"}
 
 

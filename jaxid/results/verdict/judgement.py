@@ -113,6 +113,7 @@ def judge(
         findings += [_capital(text) for text in against[1:]]
     if not identified:
         findings.append("This log determines none of the unknowns.")
+    findings += _hidden_words(session, estimate)
     worst = max((float(np.nanmax(g.force.relative, initial=0.0)) for g in gaps), default=0.0)
     doubtful = bool(against) and worst >= _NOTHING
     if doubtful:
@@ -170,6 +171,19 @@ def _delay_words(estimate: Estimate) -> list[str]:
     return [
         f"The force seems to be logged {how}: that is too long to be taken for timing, and the values are "
         "those of the log as it is."
+    ]
+
+
+def _hidden_words(session: Session, estimate: Estimate) -> list[str]:
+    """Return a sentence on the unknowns that the noise of the readings hides, if there are any."""
+    hidden = estimate.details.get("reading_noise", {}).get("hidden", [])
+    if not hidden:
+        return []
+    more = f" and {len(hidden) - _MOST} more" if len(hidden) > _MOST else ""
+    other = "" if session.fit.log.integrated else "; the method instrumental_variable may"
+    return [
+        f"Noise of the readings hides {', '.join(hidden[:_MOST])}{more}: a faster log, finer encoders or "
+        f"faster motion would show them{other}."
     ]
 
 
