@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from jaxid.estimators.recursive.real_time import RealTime as RealTime
     from jaxid.experiment_design.along_reference import Excitation as Excitation
     from jaxid.experiment_design.in_loop import Design as Design
-    from jaxid.experiment_design.unforced import UnforcedDesign as UnforcedDesign
+    from jaxid.experiment_design.unforced_design import UnforcedDesign as UnforcedDesign
     from jaxid.gap import Gap as Gap
     from jaxid.logs.in_memory import as_log as as_log
     from jaxid.logs.log import Log as Log
@@ -121,7 +121,7 @@ _HOMES = {
     "FirstCase": ("jaxid.commands.init", "FirstCase"),
     "Design": ("jaxid.experiment_design.in_loop", "Design"),
     "Excitation": ("jaxid.experiment_design.along_reference", "Excitation"),
-    "UnforcedDesign": ("jaxid.experiment_design.unforced", "UnforcedDesign"),
+    "UnforcedDesign": ("jaxid.experiment_design.unforced_design", "UnforcedDesign"),
     "Parameter": ("jaxid.results.parameters", "Parameter"),
     "ParameterTable": ("jaxid.results.parameters", "ParameterTable"),
     "Covariance": ("jaxid.results.parameters", "Covariance"),

@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         ready_file(case, overwrite=args.force, suffix=".toml")
     with progress_of(args) as show:
         from jaxid.commands.design import design
-        from jaxid.experiment_design.unforced import UnforcedDesign
+        from jaxid.experiment_design.unforced_design import UnforcedDesign
 
         found = design(args.case, args.log or None, progress=show)
     found.save(path)

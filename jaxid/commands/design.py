@@ -11,7 +11,8 @@ from jaxid.commands.identify import Identification, identify
 from jaxid.errors import InputError
 from jaxid.experiment_design.along_reference import Excitation, excite
 from jaxid.experiment_design.in_loop import Design, design_in_loop
-from jaxid.experiment_design.unforced import UnforcedDesign, designed_unforced
+from jaxid.experiment_design.unforced import designed_unforced
+from jaxid.experiment_design.unforced_design import UnforcedDesign
 from jaxid.scene import sampling_of
 from jaxid.session import Logs
 

@@ -14,7 +14,7 @@ from jaxid.first_case.section import toml
 from jaxid.results.found_case import case_text, edited_or_whole, text_of_case
 
 if TYPE_CHECKING:
-    from jaxid.experiment_design.unforced import UnforcedDesign
+    from jaxid.experiment_design.unforced_design import UnforcedDesign
 
 PRESENT, DESIGNED, SECOND = "present", "designed", "designed_second"
 

@@ -40,7 +40,7 @@ ADDING = {
     "simulation/step_size.py": {"ViscousFriction"},
     "estimators/minimal/read_back.py": {"ViscousFriction"},
     "experiment_design/next_case.py": {"AddedMass"},
-    "experiment_design/unforced.py": {"AddedMass"},
+    "experiment_design/second_logs.py": {"AddedMass"},
 }
 
 
