@@ -132,6 +132,17 @@ def position_jacobian(machine: Machine, log: Log, numerics: Numerics) -> np.ndar
     return -np.asarray(_jacobian(replay, unknown.places, machine.plant, measured, unknown.guess))
 
 
+def position_gap(machine: Machine, log: Log, numerics: Numerics) -> np.ndarray:
+    """Return measured minus simulated position at the guesses, (time, n); see `position_jacobian`."""
+    replay = with_fitted_start(make_replay(machine, log, numerics), machine.plant, log)
+    return log.filled - np.asarray(_position(replay, machine.plant))
+
+
+@kept_jit
+def _position(replay: Replay, plant: Plant) -> Array:
+    return replay(plant).position
+
+
 @kept_jit
 def _jacobian(replay: Replay, places: tuple, plant: Plant, measured: Array, theta: Array) -> Array:
     residual = output_residual(replay, places, plant, measured, jnp.ones(measured.shape))

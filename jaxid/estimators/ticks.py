@@ -12,11 +12,13 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.mean_readings import noise_of_parts
 from jaxid.estimators.output_fit import OutputFit, outputs_of
 from jaxid.estimators.several.parts import Part
+from jaxid.estimators.simulated_output import choose_numerics, position_gap, position_jacobian
 from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER
 from jaxid.numerics.lanes import Steps
 from jaxid.simulation.noisy_loop import ReadingNoise
 from jaxid.simulation.replay import Numerics
+from jaxid.simulation.sensor_noise import position_noise
 
 # Ticks beside the best one that are compared, and parts of a row of the log: a command that is held from row
 # to row leaves the cost several minima along the delay.
@@ -30,6 +32,11 @@ _RENEWALS = 4
 _EQUAL, _SAME, _FAR = 6.0, 0.3, 50.0
 # Squared residual without noise, as a multiple of the least one, up to which mean readings are fitted.
 _NEARLY = 1.5
+# Most ticks by which the delays of several joints are moved, and the gain in minus twice the logarithm of the
+# likelihood that calls for another tick.
+_ROUNDS, _GAIN = 6, 4.0
+# Most moves of a delay that are tried in a round.
+_TRIED = 2
 
 
 def at_ticks(machine: Machine, theta: Float[np.ndarray, " p"], step: int = 0) -> Float[np.ndarray, " p"]:
@@ -86,6 +93,42 @@ def best_ticks(
     return [fit.theta for fit in ranked if fit.chi - ranked[0].chi < _EQUAL]
 
 
+def best_ticks_of_joints(
+    machine: Machine, parts: Sequence[Part], theta: Float[np.ndarray, " p"], numerics: Numerics | None = None
+) -> Steps[Float[np.ndarray, " p"]]:
+    """Find the tick of each joint's delay at which a loop without noise is nearest to the logs.
+
+    The delay of one joint is moved by a tick, while all other unknowns are fitted. Of all joints and both
+    sides, the move is tried that the derivatives promise most of.
+
+    Args:
+        machine: Machine of all logs, with its controller.
+        parts: The logs, without a force.
+        theta: Values of a fit, (p,).
+        numerics: Settings of the integration; None: chosen from machines and logs.
+
+    Returns:
+        Values of the unknowns at the best ticks, (p,); those of the fit if there is no unknown delay, or the
+        fit at its ticks does not converge.
+    """
+    if machine.controller is None or not np.any(_delays(machine)):
+        return theta
+    fits = _HeldFits(machine, parts, numerics)
+    best, least = yield from fits.without_noise(at_ticks(machine, theta))
+    if not np.isfinite(least):
+        return theta
+    for _ in range(_ROUNDS):
+        before = least
+        for start in fits.promising(best)[:_TRIED]:
+            values, chi = yield from fits.without_noise(start)
+            if chi < least - _GAIN:
+                best, least = values, chi
+                break
+        if least == before:
+            break
+    return best
+
+
 @dataclass(frozen=True)
 class _HeldFit:
     """A fit with its delays held.
@@ -121,7 +164,7 @@ class _HeldFits:
         Mean readings are left out where the loop without noise is far from that of other fits, and are not
         refined where they are.
         """
-        theta, plain = yield from self._fitted(start, [])
+        theta, plain = yield from self.without_noise(start)
         nearest = min((fit.plain for fit in others), default=np.inf)
         least = min((fit.chi for fit in others), default=np.inf)
         out = _HeldFit(theta, plain, np.inf)
@@ -138,6 +181,49 @@ class _HeldFits:
             if settled or chi > least + _FAR:
                 break
         return out
+
+    def without_noise(self, start: Float[np.ndarray, " p"]) -> Steps[tuple[Float[np.ndarray, " p"], float]]:
+        """Return the fit of one run of each loop without noise; see `_fitted`."""
+        return (yield from self._fitted(start, []))
+
+    def promising(self, theta: Float[np.ndarray, " p"]) -> list[Float[np.ndarray, " p"]]:
+        """Return values with the delay of one joint a tick off that promise a better fit, the best first.
+
+        The other unknowns are those of a step of Gauss and Newton, with the derivatives at the given values.
+
+        Args:
+            theta: Values of a fit with the delays held at ticks, (p,).
+        """
+        delays, controller = _delays(self.machine), self.machine.controller
+        assert controller is not None, "checked by best_ticks_of_joints"
+        at = [part.at(theta) for part in self.parts]
+        every = [self.numerics or choose_numerics(m, p.log) for m, p in zip(at, self.parts, strict=True)]
+        scales = [1.0 / position_noise(m, p.log) for m, p in zip(at, self.parts, strict=True)]
+        rows = [
+            part.widened(scale[:, None] * position_jacobian(m, part.log, numerics), len(theta))
+            for m, part, numerics, scale in zip(at, self.parts, every, scales, strict=True)
+        ]
+        jacobian = np.concatenate([row.reshape(-1, len(theta)) for row in rows])[:, ~delays]
+        sizes = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+
+        def step(values: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
+            gaps = [
+                (scale * position_gap(part.at(values), part.log, numerics)).ravel()
+                for part, numerics, scale in zip(self.parts, every, scales, strict=True)
+            ]
+            gap = np.concatenate(gaps)
+            change = np.linalg.lstsq(jacobian / sizes, gap, rcond=None)[0]
+            moved = values.copy()
+            moved[~delays] += change / sizes
+            return float(np.sum(np.square(gap - jacobian / sizes @ change))), moved
+
+        here, _ = step(theta)
+        moves = []
+        for k in np.flatnonzero(delays):
+            for tick in (-controller.period, controller.period):
+                if theta[k] + tick > -0.5 * controller.period:
+                    moves.append(step(theta + tick * (np.arange(len(theta)) == k)))
+        return [moved for left, moved in sorted(moves, key=lambda m: m[0]) if left < here]
 
     @property
     def _samples(self) -> int:

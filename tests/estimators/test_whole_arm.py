@@ -12,6 +12,7 @@ from jaxid.estimators.apart.joint import is_arm_of_servos, stands_apart, unknown
 from jaxid.estimators.apart.steps import apart_steps
 from jaxid.estimators.apart.whole import why_not_whole
 from jaxid.estimators.several.parts import parts_of
+from jaxid.estimators.ticks import best_ticks_of_joints
 from jaxid.numerics.lanes import run_alone
 from jaxid.session import open_session
 
@@ -115,3 +116,19 @@ def test_noise_that_goes_round_the_loop_is_in_the_fitted_mean():
     fit = covered(of("arm_coverage", 13))
     assert fit["converged"]
     assert max(map(abs, fit["z"].values())) < 2.5
+
+
+@pytest.mark.slow
+def test_a_fit_beside_the_true_tick_moves_to_it():
+    """From a tick beside the true one at both joints; the delays are whole ticks of the exact stepper."""
+    drawn = of("arm_coverage", 0)
+    session = open_session(drawn.case(), drawn.columns())
+    machine, parts = session.machine, parts_of(session)
+    names, period = machine.parameters.names, 1 / drawn.rate
+    true = np.array([drawn.truth()[name] for name in names])
+    delays = np.array(["delay" in name for name in names])
+    for steps in ((1, 1), (1, -1), (-2, 0)):
+        start = true.copy()
+        start[delays] += period * np.array(steps)
+        found = run_alone(best_ticks_of_joints(machine, parts, start))
+        np.testing.assert_allclose(found[delays], true[delays], atol=1e-9)

@@ -108,7 +108,7 @@ def unknowns_of_joints(machine: Machine) -> list[int]:
     if not isinstance(machine.plant, LinkTree):
         return []
     free = enumerate(machine.parameters.free)
-    return [k for k, f in free if f.log is None and _joint_of(f, machine) is not None]
+    return [k for k, f in free if f.log is None and joint_of(f, machine) is not None]
 
 
 def unknowns_of_links(machine: Machine) -> list[int]:
@@ -152,7 +152,7 @@ def joints_alone(machine: Machine, parts: Sequence[Part], others: Sequence[Part]
     out = []
     for joint in range(machine.plant.joints):
         own = [
-            n for n, f in zip(names, machine.parameters.free, strict=True) if _joint_of(f, machine) == joint
+            n for n, f in zip(names, machine.parameters.free, strict=True) if joint_of(f, machine) == joint
         ]
         if not own:
             continue
@@ -176,7 +176,7 @@ def _moves(part: Part) -> bool:
     return part.log.reference is not None and bool(np.ptp(part.log.reference) > 0)
 
 
-def _joint_of(f: Free, machine: Machine) -> int | None:
+def joint_of(f: Free, machine: Machine) -> int | None:
     """Return the only joint to which an unknown of an arm belongs; None if there is none."""
     plant = machine.plant
     if f.effect is not None:
@@ -222,7 +222,7 @@ def _machine(machine: Machine, joint: int, links: float, load: Float[np.ndarray,
     effects: tuple[Effect, ...] = tuple(replace(e, port=0) for e in plant.effects if e.port == joint)
     scale = plant.smoothing.velocity_scale
     smoothing = replace(plant.smoothing, velocity_scale=scale if np.ndim(scale) == 0 else scale[joint])
-    own = [f for f in machine.parameters.free if _joint_of(f, machine) == joint]
+    own = [f for f in machine.parameters.free if joint_of(f, machine) == joint]
     free = [_free(f, machine, joint, links, ratio) for f in own]
     return replace(
         machine,

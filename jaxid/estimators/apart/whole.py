@@ -29,7 +29,7 @@ from jaxid.estimators.mean_readings import fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.several.parts import Part
 from jaxid.estimators.simulated_output import choose_numerics
-from jaxid.estimators.ticks import at_ticks
+from jaxid.estimators.ticks import at_ticks, best_ticks_of_joints
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import Steps
 from jaxid.simulation.replay import Numerics
@@ -38,8 +38,9 @@ from jaxid.simulation.sensor_noise import position_noise
 # Largest work of a Jacobian of the whole arm: steps of integration times columns times entries of the mass
 # matrix. Two joints over 6 s at 1 kHz have 3e5, and a fit takes seconds; with this much it takes minutes.
 _WORK = 1e7
-# Factor in RMS over the noise beyond which a fit is tried again.
-_FAR = 1.2
+# Factors in RMS over the noise: beyond the first a fit is tried again; up to the second the ticks beside its
+# delays are tried, and the mean readings are fitted. A wrong tick and the noise in the loop leave as much.
+_FAR, _NEAR = 1.2, 2.0
 # Most times that it is, and the part of its misfit that another time must gain to call for the next.
 _RENEWALS, _NEWS = 3, 0.01
 _NOTE = (
@@ -95,9 +96,9 @@ def whole_steps(
 ) -> Steps[Estimate]:
     """Fit all unknowns of an arm at once, from some values and from better ones that the fit leads to.
 
-    These are the ticks nearest to its delays, because between two ticks dry friction may hold a fit; and,
-    while more than noise is left, fits of the joints alone under the forces of the arm in simulation. A log
-    alone of which no more than noise is left is fitted by the mean readings of the loop with this noise.
+    These are the ticks nearest to its delays, because between two ticks dry friction may hold a fit; while
+    more than noise is left, fits of the joints alone under the forces of the arm in simulation; and, once
+    little more is left, the ticks beside them. The mean readings of the loop with this noise are then fitted.
 
     Args:
         machine: Machine of all logs.
@@ -111,7 +112,7 @@ def whole_steps(
     options |= {"tolerance": TOLERANCE} if len(parts) > 1 else {}
     best = yield from _to_ticks(machine, parts, start, **options)
     for _ in range(_RENEWALS):
-        if not _leaves_more_than_noise(best, parts):
+        if not _leaves_more_than_noise(best, parts, _FAR):
             break
         again = yield from _by_simulated_loads(machine, parts, best.theta)
         new = yield from _to_ticks(machine, parts, again, **options)
@@ -119,10 +120,13 @@ def whole_steps(
         best = min(best, new, key=_rank)
         if not gained > _NEWS * abs(misfit(best)):
             break
-    if len(parts) == 1 and best.converged and not _leaves_more_than_noise(best, parts):
-        # One run without noise, shifted: the noise of every joint in each run takes ten times as long.
-        noisy = yield from fitted_with_noise(machine, parts[0].log, best.theta, follows=False, **options)
-        best = noisy or best
+    if not best.converged or _leaves_more_than_noise(best, parts, _NEAR):
+        return replace(best, notes=(_NOTE, *best.notes))
+    ticks = yield from best_ticks_of_joints(machine, parts, best.theta, options.get("numerics"))
+    best = min(best, (yield from output_error_steps(machine, parts, start=ticks, **options)), key=_rank)
+    # One run without noise, shifted: the noise of every joint in each run takes ten times as long.
+    noisy = yield from fitted_with_noise(machine, parts, best.theta, follows=False, **options)
+    best = noisy or best
     return replace(best, notes=(_NOTE, *best.notes))
 
 
@@ -141,12 +145,12 @@ def _to_ticks(
     return min(first, (yield from output_error_steps(machine, parts, start=ticks, **options)), key=_rank)
 
 
-def _leaves_more_than_noise(fit: Estimate, parts: Sequence[Part]) -> bool:
-    """Check whether a fit leaves more than the noise of an encoder in any log."""
+def _leaves_more_than_noise(fit: Estimate, parts: Sequence[Part], factor: float) -> bool:
+    """Check whether a fit leaves more than the noise of an encoder times a factor in any log."""
     ends = np.cumsum([part.log.samples for part in parts])[:-1]
     for rows, part in zip(np.split(fit.residual, ends), parts, strict=True):
         floor = position_noise(part.machine, part.log)
-        if np.any(np.sqrt(np.nanmean(np.square(rows), axis=0)) > _FAR * floor):
+        if np.any(np.sqrt(np.nanmean(np.square(rows), axis=0)) > factor * floor):
             return True
     return False
 
