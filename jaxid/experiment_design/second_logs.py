@@ -20,9 +20,13 @@ from jaxid.experiment_design.unforced_design import SecondLog
 from jaxid.machine import Machine
 from jaxid.model.parameter import parameters_of
 from jaxid.model.unknowns import CONTROLLER
+from jaxid.plants.link_tree import LinkTree
 
-# Payloads that are tried, as parts of the inertia, and changes of a known gain.
-_PAYLOADS, _GAINS = (0.25, 1.0), (0.5, 2.0)
+# Payloads that are tried, as parts of the inertia of an axis and of the mass of a robot; changes of a gain.
+_PAYLOADS, _OF_ROBOT, _GAINS = (0.25, 1.0), (0.05, 0.2), (0.5, 2.0)
+
+# What differs in words, the values that `set` in [[fit]] takes, and the machine with them.
+Change = tuple[str, dict[str, float | list[float]], Machine]
 
 
 def second_logs(
@@ -46,7 +50,8 @@ def second_logs(
         held: Unknowns that are held because nothing gives a scale.
     """
     width, out = len(present.machine.parameters.free), []
-    for what, values, machine in (*_loaded(case, present.machine), *_other_gains(present.machine)):
+    changes = (*_loaded(case, present.machine), *_loaded_link(present.machine), *_other_gains(case, present))
+    for what, values, machine in changes:
         log = played(machine, signal, rate)
         if limits.broken(peaks_of(machine, log)):
             continue
@@ -57,8 +62,8 @@ def second_logs(
     return tuple(out)
 
 
-def _loaded(case: Case, machine: Machine) -> list[tuple[str, dict[str, float], Machine]]:
-    """Return the machine with payloads that are known; none if an added mass is an unknown."""
+def _loaded(case: Case, machine: Machine) -> list[Change]:
+    """Return an axis with payloads that are known; none if an added mass is an unknown."""
     inertia = machine.plant.own_inertia()
     declared = [e for e in case.effects if e.cls is AddedMass]
     unknown = [f for f in machine.parameters.free if f.name.startswith(AddedMass.kind)]
@@ -77,16 +82,40 @@ def _loaded(case: Case, machine: Machine) -> list[tuple[str, dict[str, float], M
     return out
 
 
-def _other_gains(machine: Machine) -> list[tuple[str, dict[str, float], Machine]]:
+def _loaded_link(machine: Machine) -> list[Change]:
+    """Return a robot with payloads that are known where its case has a place for them."""
+    plant = machine.plant
+    if not isinstance(plant, LinkTree) or plant.payload is None or plant.payload_position is None:
+        return []
+    if any(f.path[0] == "payload" for f in machine.parameters.free):
+        return []
+    carriers = np.flatnonzero(np.any(np.asarray(plant.payload_position) != 0, axis=1))
+    link = int(carriers[-1]) if carriers.size else len(plant.payload) - 1
+    there, robot = float(plant.payload[link]), float(np.sum(np.asarray(plant.mass)))
+    out = []
+    for part in sorted(_OF_ROBOT, reverse=True):
+        mass = float(f"{part * robot:.2g}")
+        if mass <= 0:
+            continue
+        loaded = replace(plant, payload=jnp.asarray(plant.payload).at[link].add(mass))
+        values = {f"payload[{link + 1}]": there + mass}
+        what = f"a payload of {mass:g} kg at link {link + 1} that is known"
+        out.append((what, values, machine.with_plant(loaded, machine.parameters)))
+    return out
+
+
+def _other_gains(case: Case, present: Present) -> list[Change]:
     """Return the machine with its first stated gain halved and doubled; none if no gain is stated."""
+    machine = present.machine
     law, names = machine.controller, stated_gains(machine)
-    if law is None or not names:
+    # Gains of a robot's file stand in no [controller], where a second log could set them.
+    if law is None or not names or case.controller is None:
         return []
     out = []
     for factor in _GAINS:
         value = factor * np.asarray(getattr(law, names[0]), float)
-        if value.size == 1:
-            changed = replace(machine, controller=replace(law, **{names[0]: jnp.asarray(value)}))
-            number = float(value.ravel()[0])
-            out.append((f"{names[0]} = {number:g}", {f"{CONTROLLER}.{names[0]}": number}, changed))
+        changed = replace(machine, controller=replace(law, **{names[0]: jnp.asarray(value)}))
+        numbers = [float(x) for x in value.ravel()]
+        what = f"{names[0]} = {', '.join(f'{x:g}' for x in numbers)}"
+        out.append((what, {f"{CONTROLLER}.{names[0]}": numbers if len(numbers) > 1 else numbers[0]}, changed))
     return out

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxid.case.case import Case
 from jaxid.errors import InputError
@@ -18,6 +19,7 @@ from jaxid.estimators.several.parts import Part
 from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.estimators.unforced import base_of, common_scale_group, without
 from jaxid.estimators.within_prior.prior import Prior
+from jaxid.experiment_design.by_trials import Trials, informative_commands
 from jaxid.experiment_design.in_loop import (
     PRIOR,
     SHARPNESS,
@@ -32,10 +34,12 @@ from jaxid.experiment_design.position_information import (
     PositionInformation,
     gained,
     log_at_rest,
+    peaks_of,
     played,
 )
 from jaxid.experiment_design.present import Present, present_of
 from jaxid.experiment_design.second_logs import second_logs
+from jaxid.experiment_design.shapes import Shapes
 from jaxid.experiment_design.unforced_design import UnforcedDesign
 from jaxid.machine import Machine
 from jaxid.model.unknowns import CONTROLLER
@@ -55,8 +59,9 @@ def designed_unforced(
 ) -> UnforcedDesign:
     """Find the reference whose log, without a force, would tell the unknowns best beside the present logs.
 
-    Gradients through the smoothed loop maximise the determinant of the information of the position. The
-    deviations of the result are those of the loop with exact dry friction.
+    The search maximises the determinant of the information of the position: for an arm by trials of the whole
+    arm (`jaxid.experiment_design.by_trials`), else by gradients through the smoothed loop. The deviations of
+    the result are those of the loop with exact dry friction.
 
     Args:
         case: The case, with the tables that `jaxid.design` requires.
@@ -64,8 +69,8 @@ def designed_unforced(
         progress: Called with a line of text at every stage.
 
     Raises:
-        InputError: If the joints of the machine are linked, the noise of the encoder is not known, the rate
-            of the log does not go with that of the loop, or no experiment keeps within the limits.
+        InputError: If the noise of the encoder is not known, the rate of the log does not go with that of
+            the loop, or no experiment keeps within the limits.
     """
     _refuse(case)
     rate, duration = sampling_of(case)
@@ -83,8 +88,8 @@ def designed_unforced(
     group = common_scale_group(machine, [*present.parts, blank])
     base = base_of(machine, group) if group else None
     held = () if base is None else (base,)
-    problem = _problem(case, present, limits, base, known)
-    signals = informative_signals(problem, case.where, progress, _IMPROVED, _EVALUATIONS)
+    search = _by_trials if case.plant.cls.linked else _by_gradients
+    signals = search(case, present, limits, base, known, progress)
 
     progress("computing the expected precision of each")
     parts = [Part.alone(machine, played(machine, signal, rate)) for signal in signals]
@@ -110,17 +115,13 @@ def designed_unforced(
         stating={machine.parameters.names[k]: present.std(whole, (k,)) for k in gains},
         second=second,
         noise=present.noise,
-        peaks=problem.peaks(signal),
+        peaks=peaks_of(machine, parts[best].log),
         result=result,
     )
 
 
 def _refuse(case: Case) -> None:
     """Refuse a machine, or settings, for which no such experiment is designed."""
-    if case.plant.cls.linked:
-        what = "no experiment is designed for an arm whose log has no force"
-        hint = "design one joint after the other as plant.kind = 'axis', or log the force"
-        raise InputError(what, where=case.where, hint=hint)
     if case.identification.per_log:
         what = "no experiment is designed for unknowns with a value in each log"
         hint = "leave per_log out, and state what is known to differ by set in [[fit]]"
@@ -140,38 +141,88 @@ def _limits(case: Case, machine: Machine) -> Limits:
     return limits
 
 
-def _problem(
-    case: Case, present: Present, limits: Limits, base: int | None, known: PositionInformation
-) -> LoopDesign:
-    """Set up the search for a reference, one value a row of the log, with the base of a scale held."""
+def _by_trials(
+    case: Case,
+    present: Present,
+    limits: Limits,
+    base: int | None,
+    known: PositionInformation,
+    progress: Callable[[str], None],
+) -> list[Float[np.ndarray, "rows m"]]:
+    """Return the tour and the best command of those that are tried, with the base of a scale held."""
+    shapes, starts = _commands(case, present.machine, limits)
+    held = () if base is None else (base,)
+    trials = Trials(present, known, held, limits, shapes, sampling_of(case)[0])
+    return [trial.signal for trial in informative_commands(trials, starts, case.where, progress)]
+
+
+def _by_gradients(
+    case: Case,
+    present: Present,
+    limits: Limits,
+    base: int | None,
+    known: PositionInformation,
+    progress: Callable[[str], None],
+) -> list[Float[np.ndarray, "rows m"]]:
+    """Return commands, the tour first, improved by gradients through the smoothed loop."""
+    problem = _problem(case, present, limits, base, known)
+    return informative_signals(problem, case.where, progress, _IMPROVED, _EVALUATIONS)
+
+
+def _commands(case: Case, machine: Machine, limits: Limits) -> tuple[Shapes, list[np.ndarray]]:
+    """Return the family of commands with a value a row of the log, and those from which a search starts.
+
+    Raises:
+        InputError: If the log's rate is no whole part of the loop's, or the machine cannot start where the
+            case says.
+    """
     rate, duration = sampling_of(case)
-    machine = present.machine if base is None else without(present.machine, base)
     assert machine.controller is not None, "without a controller there is no loop"
     period = float(machine.controller.period)
-    every = max(1, round(1 / (rate * period)))
-    if abs(1 / (rate * period * every) - 1) > _WHOLE:
+    if abs(1 / (rate * period * _ticks_a_row(machine, rate)) - 1) > _WHOLE:
         raise InputError(
             f"a loop of {1 / period:g} Hz cannot be logged at sample_rate = {rate:g}",
             where=case.where,
             hint="take the loop's rate, or a whole part of it",
         )
-    rows = round(duration * rate)
-    start = np.broadcast_to(np.asarray(case.simulation.initial_position, float), case.plant.joints)
-    refuse_impossible(machine.plant, start[None], f"{case.where}, [simulation] initial_position")
-    speed = float(limits.speed.max())
-    plant = machine.plant.smoothed(np.asarray(SHARPNESS), np.asarray(speed))
-    machine = machine.with_plant(plant, machine.parameters)
+    refuse_impossible(machine.plant, _start(case)[None], f"{case.where}, [simulation] initial_position")
     stated_limit = None if case.design is None else case.design.acceleration
     acceleration = None if stated_limit is None else np.broadcast_to(stated_limit, machine.gain.shape)
-    shapes, starts = family(machine, limits, rows, 1 / rate, acceleration)
+    return family(machine, limits, round(duration * rate), 1 / rate, acceleration)
+
+
+def _ticks_a_row(machine: Machine, rate: float) -> int:
+    """Return the number of ticks of the loop in a row of its log."""
+    assert machine.controller is not None, "without a controller there is no loop"
+    return max(1, round(1 / (rate * float(machine.controller.period))))
+
+
+def _start(case: Case) -> Float[np.ndarray, " n"]:
+    """Return the position at the start, (n,)."""
+    return np.broadcast_to(np.asarray(case.simulation.initial_position, float), case.plant.joints)
+
+
+def _problem(
+    case: Case, present: Present, limits: Limits, base: int | None, known: PositionInformation
+) -> LoopDesign:
+    """Set up the search for a reference by gradients, with the base of a scale held."""
+    rate, duration = sampling_of(case)
+    machine = present.machine if base is None else without(present.machine, base)
+    shapes, starts = _commands(case, machine, limits)
+    assert machine.controller is not None, "without a controller there is no loop"
+    period, every = float(machine.controller.period), _ticks_a_row(machine, rate)
+    rows = round(duration * rate)
+    plant = machine.plant.smoothed(np.asarray(SHARPNESS), np.asarray(float(limits.speed.max())))
+    machine = machine.with_plant(plant, machine.parameters)
 
     memory = choose_numerics(machine, log_at_rest(machine, np.zeros((rows, 1)), rate))
     prior = Prior.of(machine, PRIOR, np.zeros(0))
     slope = prior.slope(machine.parameters.guess)
     matrix = known.least(present.machine, () if base is None else (base,)) * np.outer(slope, slope)
+    ticks = (rows - 1) * every + 1
     return LoopDesign(
         machine=machine,
-        replay=empty_replay(machine, start, (rows - 1) * every + 1, period, every, memory.longest_delay),
+        replay=empty_replay(machine, _start(case), ticks, period, every, memory.longest_delay),
         weight=np.tile(1.0 / present.noise, (rows, 1)),
         direct_share=np.ones(len(present.noise)),
         prior=prior,

@@ -14,6 +14,7 @@ from jaxid.case.case import Case
 from jaxid.experiment_design.limits import Peaks
 from jaxid.files import signal_csv, write_whole
 from jaxid.machine import Machine
+from jaxid.results.aligned import aligned
 
 if TYPE_CHECKING:
     from jaxid.commands.identify import Identification
@@ -30,7 +31,7 @@ class SecondLog:
     """
 
     what: str
-    values: Mapping[str, float]
+    values: Mapping[str, float | list[float]]
     std: Float[np.ndarray, " p"]
 
 
@@ -102,7 +103,7 @@ class UnforcedDesign:
         return out
 
     def __str__(self) -> str:
-        return "\n".join([*self._table(), *self._scale(), *self._second(), self._extremes()])
+        return "\n".join([*self._table(), *self._scale(), *self._second(), *self._extremes()])
 
     def _table(self) -> list[str]:
         """Return a line for each unknown: its expected deviation over its value."""
@@ -157,14 +158,26 @@ class UnforcedDesign:
         known = [k for k in range(len(std)) if np.isfinite(std[k])]
         return ", ".join(f"{self.machine.parameters.names[k]} {self._part(std, k)}" for k in known)
 
-    def _extremes(self) -> str:
-        """Return the line on the extremes of the motion."""
+    def _extremes(self) -> list[str]:
+        """Return the lines on the extremes of the motion; for several joints, a table."""
+        peaks, seconds = self.peaks, f"{self.time[-1]:.3g} s from rest"
+        columns = {"from": peaks.low, "to": peaks.high, "speed up to": peaks.speed, "noise": self.noise}
+        joints = len(peaks.low)
+        if joints == 1:
+            low, high, speed, noise = (f"{values[0]:.3g}" for values in columns.values())
+            return [
+                f"{seconds} at {self.values[0, 0]:.3g}, positions from {low} to {high}, speed up to {speed}, "
+                f"command up to {peaks.force[0]:.3g}; noise of a reading {noise}"
+            ]
+        names = self.case.plant.names or tuple(f"joint{k + 1}" for k in range(joints))
+        rows = [["", *columns]]
+        for k, name in enumerate(names):
+            rows.append([name, *(f"{values[k]:.3g}" for values in columns.values())])
+        force = ", ".join(f"{x:.3g}" for x in peaks.force)
+        return [f"{seconds}; commands of the loop up to {force}", aligned(rows), *self._unchecked()]
 
-        def shown(values: np.ndarray) -> str:
-            return ", ".join(f"{v:.3g}" for v in np.ravel(values))
-
-        return (
-            f"{self.time[-1]:.3g} s from rest at {shown(self.values[0])}, positions from "
-            f"{shown(self.peaks.low)} to {shown(self.peaks.high)}, speed up to {shown(self.peaks.speed)}, "
-            f"command up to {shown(self.peaks.force)}; noise of a reading {shown(self.noise)}"
-        )
+    def _unchecked(self) -> list[str]:
+        """Return the line on what the limits of a robot do not keep it from."""
+        if not self.case.plant.cls.linked:
+            return []
+        return ["collisions are not checked: play the command in a simulator of the cell first"]
