@@ -27,6 +27,7 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Design and write the signal, and return the exit status."""
+    from jaxid.errors import InputError
     from jaxid.files import ready_file
 
     path = ready_file(Path(args.o), overwrite=args.force)
@@ -35,6 +36,9 @@ def run(args: argparse.Namespace) -> int:
 
     case = path.with_suffix(".toml") if load_case(args.case).without_force else None
     if case is not None:
+        if case.resolve() == Path(args.case).resolve():
+            what = f"its case would be written over {args.case}"
+            raise InputError(what, where=f"-o {args.o}", hint="name the signal otherwise")
         ready_file(case, overwrite=args.force, suffix=".toml")
     with progress_of(args) as show:
         from jaxid.commands.design import design

@@ -1,14 +1,14 @@
 """Search commands for an arm by trials: draw them, keep the best, and vary it joint by joint.
 
 Derivatives by the command would take a simulation for each of its numbers and each unknown. A trial takes one
-for each unknown, and varies all joints at once: what a joint's command tells of the joint's unknowns hardly
-depends on the other joints.
+for each unknown, and varies all joints at once: the information on the unknowns of a joint hardly depends on
+the commands of the others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -29,6 +29,8 @@ from jaxid.experiment_design.shapes import Shapes
 # Trials times unknowns, since a trial simulates the arm for each unknown; least number of trials; and the
 # share of trials that are drawn before the best is varied.
 _WORK, _LEAST, _DRAWN = 1600, 20, 0.2
+# Part of the largest speed that a command uses: with a payload the arm goes a little faster.
+_PART_OF_SPEED = 0.95
 # Seed of the draws: the same case gives the same command.
 _SEED = 17
 # Share of variations that draw a joint's command anew, and share of a command's weights that others change.
@@ -37,7 +39,7 @@ _ANEW, _CHANGED = 0.15, 0.5
 
 @dataclass(frozen=True)
 class Trial:
-    """A command that keeps within the limits, and what its log tells.
+    """Hold a command that keeps within the limits, and the information of its log.
 
     Args:
         numbers: Numbers of the command in its family.
@@ -56,7 +58,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Trials:
-    """Hold what every trial needs.
+    """Hold the machine, the limits and the family of commands of all trials.
 
     Args:
         present: The machine, the noise and the present logs.
@@ -81,7 +83,8 @@ class Trials:
         def peaks(signal: Float[np.ndarray, "rows m"]) -> Peaks:
             return peaks_of(machine, played(machine, signal, self.rate))
 
-        kept = kept_within(self.limits, self.shapes, numbers, peaks)
+        limits = replace(self.limits, speed=_PART_OF_SPEED * self.limits.speed)
+        kept = kept_within(limits, self.shapes, numbers, peaks)
         if kept is None:
             return None
         numbers, signal, _ = kept
@@ -93,7 +96,7 @@ class Trials:
         return Trial(numbers, signal, information, nats, self._by_joint(information))
 
     def _by_joint(self, information: PositionInformation) -> Float[np.ndarray, " n"]:
-        """Return what is told of the unknowns of each joint, if all others were known [nats]."""
+        """Return the information on the unknowns of each joint, if all others were known [nats]."""
         machine = self.present.machine
         joints = [joint_of(f, machine) for f in machine.parameters.free]
         guess, out = machine.parameters.guess, []
@@ -104,7 +107,7 @@ class Trials:
         return np.array(out)
 
     def mixed(self, best: Trial, other: Trial) -> Float[np.ndarray, " k"] | None:
-        """Return the best command with those joints of another that tell more of themselves.
+        """Return the best command with those joints of another that have more information on themselves.
 
         Returns:
             Its numbers; None if all joints are those of one of the two.
@@ -151,10 +154,10 @@ class Trials:
 def informative_commands(
     trials: Trials, starts: list[np.ndarray], where: str, progress: Callable[[str], None]
 ) -> list[Trial]:
-    """Return the tour, and the command that tells most of all that are tried.
+    """Return the tour, and the most informative of all commands that are tried.
 
     Args:
-        trials: What every trial needs.
+        trials: Machine, limits and family of commands.
         starts: Numbers of commands to begin with, the tour first.
         where: The case, for messages.
         progress: Called with a line of text at every stage.
@@ -183,7 +186,7 @@ def informative_commands(
 
 
 def _with_mixed(trials: Trials, best: Trial, numbers: np.ndarray) -> Iterator[Trial]:
-    """Try a command, and the best one with the joints at which it tells more."""
+    """Try a command, and the best one with the joints at which it has more information."""
     other = trials.trial(numbers)
     if other is None:
         return

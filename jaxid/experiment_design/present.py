@@ -1,4 +1,4 @@
-"""Hold what is there before an experiment without a force: logs and their fit, or guesses alone."""
+"""Hold the start of an experiment without a force: logs and their fit, or guesses alone."""
 
 from __future__ import annotations
 
@@ -22,10 +22,13 @@ from jaxid.machine import Machine
 if TYPE_CHECKING:
     from jaxid.commands.identify import Identification
 
+# Part of the motion that a fit leaves and beyond which it does not follow the log.
+_LOST = 0.3
+
 
 @dataclass(frozen=True)
 class Present:
-    """Hold what is there before an experiment: a machine and logs, or guesses alone.
+    """Hold the start of an experiment: a machine and logs, or guesses alone.
 
     Args:
         machine: The machine at its values.
@@ -61,8 +64,8 @@ def present_of(case: Case, result: Identification | None, rate: float) -> Presen
         noise = np.broadcast_to(np.asarray(std, float), case.plant.joints)
         return Present(_with_noise(machine, noise), (), noise, None, _least_std(case, machine))
 
-    if not result.estimate.converged:
-        what = "the fit of the present log did not converge"
+    if not result.estimate.converged and not _follows(result):
+        what = "the fit of the present log did not converge, and does not follow the log"
         raise InputError(what, where=case.where, hint="fit it by `jaxid identify`, or leave the log out")
     session = result.session
     values = np.where(
@@ -92,6 +95,17 @@ def _with_noise(machine: Machine, noise: Float[np.ndarray, " n"]) -> Machine:
     """
     sensor = replace(machine.sensor, position_noise=jnp.asarray(noise), position_resolution=None)
     return replace(machine, sensor=sensor)
+
+
+def _follows(result: Identification) -> bool:
+    """Check whether a fit follows its logs; it may not converge where they hardly show some unknowns."""
+    if not np.all(np.isfinite(result.estimate.theta)):
+        return False
+    for run, gap in zip(result.session.fits, result.gaps, strict=False):
+        moved = np.std(run.log.filled, axis=0)
+        if gap.simulation is None or np.any(gap.simulation.rms > _LOST * np.max(moved)):
+            return False
+    return True
 
 
 def _left(result: Identification, joints: int) -> Float[np.ndarray, " n"]:

@@ -1,4 +1,4 @@
-"""Second logs of a designed motion: what another payload, or another gain, would add."""
+"""Second logs of a designed motion, with another payload or another gain."""
 
 from __future__ import annotations
 

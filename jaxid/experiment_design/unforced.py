@@ -1,13 +1,13 @@
 """Design experiments for a loop whose force is not logged, by the position of the simulated loop.
 
 The information of such a log is that of its position. It never tells a scale that nothing known gives: the
-design then says what would, a gain that is stated or a payload that is known in a second log.
+design then names a remedy: a gain that is stated, or a payload that is known in a second log.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,8 +50,24 @@ if TYPE_CHECKING:
 
 # Number of most informative starts that are improved, and evaluations for each.
 _IMPROVED, _EVALUATIONS = 3, 100
-# Part by which the rate of the log may differ from a whole part of the loop's.
-_WHOLE = 1e-3
+# Part by which the rate of the log may differ from a whole part of the loop's: of a stated loop, and of one
+# whose rate is that of a log, which is no round number.
+_WHOLE, _NEARLY = 1e-3, 0.02
+
+
+@dataclass(frozen=True)
+class _Sampling:
+    """Rows of the designed log.
+
+    Args:
+        rate: Rows a second [Hz].
+        rows: Number of rows.
+        every: Ticks of the loop a row.
+    """
+
+    rate: float
+    rows: int
+    every: int
 
 
 def designed_unforced(
@@ -73,23 +89,22 @@ def designed_unforced(
             the loop, or no experiment keeps within the limits.
     """
     _refuse(case)
-    rate, duration = sampling_of(case)
-    present = present_of(case, result, rate)
+    present = present_of(case, result, sampling_of(case)[0])
     machine, width = present.machine, len(present.machine.parameters.free)
-    limits = _limits(case, machine)
+    sampling, limits = _sampling(case, machine), _limits(case, machine)
+    rate, rows = sampling.rate, sampling.rows
 
     before = [PositionInformation.of(part, present.noise, width) for part in present.parts]
     known = PositionInformation.none(width)
     for one in before:
         known = known + one
-    rows = round(duration * rate)
     stroke = np.linspace(limits.low, limits.high, rows)
     blank = Part.alone(machine, replace(log_at_rest(machine, np.zeros((rows, 1)), rate), position=stroke))
     group = common_scale_group(machine, [*present.parts, blank])
     base = base_of(machine, group) if group else None
     held = () if base is None else (base,)
     search = _by_trials if case.plant.cls.linked else _by_gradients
-    signals = search(case, present, limits, base, known, progress)
+    signals = search(case, present, sampling, limits, base, known, progress)
 
     progress("computing the expected precision of each")
     parts = [Part.alone(machine, played(machine, signal, rate)) for signal in signals]
@@ -144,57 +159,68 @@ def _limits(case: Case, machine: Machine) -> Limits:
 def _by_trials(
     case: Case,
     present: Present,
+    sampling: _Sampling,
     limits: Limits,
     base: int | None,
     known: PositionInformation,
     progress: Callable[[str], None],
 ) -> list[Float[np.ndarray, "rows m"]]:
     """Return the tour and the best command of those that are tried, with the base of a scale held."""
-    shapes, starts = _commands(case, present.machine, limits)
+    shapes, starts = _commands(case, present.machine, sampling, limits)
     held = () if base is None else (base,)
-    trials = Trials(present, known, held, limits, shapes, sampling_of(case)[0])
+    trials = Trials(present, known, held, limits, shapes, sampling.rate)
     return [trial.signal for trial in informative_commands(trials, starts, case.where, progress)]
 
 
 def _by_gradients(
     case: Case,
     present: Present,
+    sampling: _Sampling,
     limits: Limits,
     base: int | None,
     known: PositionInformation,
     progress: Callable[[str], None],
 ) -> list[Float[np.ndarray, "rows m"]]:
     """Return commands, the tour first, improved by gradients through the smoothed loop."""
-    problem = _problem(case, present, limits, base, known)
+    problem = _problem(case, present, sampling, limits, base, known)
     return informative_signals(problem, case.where, progress, _IMPROVED, _EVALUATIONS)
 
 
-def _commands(case: Case, machine: Machine, limits: Limits) -> tuple[Shapes, list[np.ndarray]]:
+def _commands(
+    case: Case, machine: Machine, sampling: _Sampling, limits: Limits
+) -> tuple[Shapes, list[np.ndarray]]:
     """Return the family of commands with a value a row of the log, and those from which a search starts.
 
     Raises:
-        InputError: If the log's rate is no whole part of the loop's, or the machine cannot start where the
-            case says.
+        InputError: If the machine cannot start where the case says.
+    """
+    refuse_impossible(machine.plant, _start(case)[None], f"{case.where}, [simulation] initial_position")
+    stated_limit = None if case.design is None else case.design.acceleration
+    acceleration = None if stated_limit is None else np.broadcast_to(stated_limit, machine.gain.shape)
+    return family(machine, limits, sampling.rows, 1 / sampling.rate, acceleration)
+
+
+def _sampling(case: Case, machine: Machine) -> _Sampling:
+    """Return the rows of the log that a case asks for, at a whole part of the loop's rate.
+
+    Raises:
+        InputError: If the rate of the log is no whole part of the loop's.
     """
     rate, duration = sampling_of(case)
     assert machine.controller is not None, "without a controller there is no loop"
     period = float(machine.controller.period)
-    if abs(1 / (rate * period * _ticks_a_row(machine, rate)) - 1) > _WHOLE:
+    every = max(1, round(1 / (rate * period)))
+    whole = 1 / (every * period)
+    stated = None if case.controller is None else case.controller.period
+    # The period of a robot's file is that of its simulation; the machine has that of the log.
+    is_stated = stated is not None and np.isclose(period, stated, rtol=_WHOLE)
+    if abs(whole / rate - 1) > (_WHOLE if is_stated else _NEARLY):
         raise InputError(
             f"a loop of {1 / period:g} Hz cannot be logged at sample_rate = {rate:g}",
             where=case.where,
             hint="take the loop's rate, or a whole part of it",
         )
-    refuse_impossible(machine.plant, _start(case)[None], f"{case.where}, [simulation] initial_position")
-    stated_limit = None if case.design is None else case.design.acceleration
-    acceleration = None if stated_limit is None else np.broadcast_to(stated_limit, machine.gain.shape)
-    return family(machine, limits, round(duration * rate), 1 / rate, acceleration)
-
-
-def _ticks_a_row(machine: Machine, rate: float) -> int:
-    """Return the number of ticks of the loop in a row of its log."""
-    assert machine.controller is not None, "without a controller there is no loop"
-    return max(1, round(1 / (rate * float(machine.controller.period))))
+    return _Sampling(whole, round(duration * whole), every)
 
 
 def _start(case: Case) -> Float[np.ndarray, " n"]:
@@ -203,19 +229,22 @@ def _start(case: Case) -> Float[np.ndarray, " n"]:
 
 
 def _problem(
-    case: Case, present: Present, limits: Limits, base: int | None, known: PositionInformation
+    case: Case,
+    present: Present,
+    sampling: _Sampling,
+    limits: Limits,
+    base: int | None,
+    known: PositionInformation,
 ) -> LoopDesign:
     """Set up the search for a reference by gradients, with the base of a scale held."""
-    rate, duration = sampling_of(case)
     machine = present.machine if base is None else without(present.machine, base)
-    shapes, starts = _commands(case, machine, limits)
+    shapes, starts = _commands(case, machine, sampling, limits)
     assert machine.controller is not None, "without a controller there is no loop"
-    period, every = float(machine.controller.period), _ticks_a_row(machine, rate)
-    rows = round(duration * rate)
+    period, rows, every = float(machine.controller.period), sampling.rows, sampling.every
     plant = machine.plant.smoothed(np.asarray(SHARPNESS), np.asarray(float(limits.speed.max())))
     machine = machine.with_plant(plant, machine.parameters)
 
-    memory = choose_numerics(machine, log_at_rest(machine, np.zeros((rows, 1)), rate))
+    memory = choose_numerics(machine, log_at_rest(machine, np.zeros((rows, 1)), sampling.rate))
     prior = Prior.of(machine, PRIOR, np.zeros(0))
     slope = prior.slope(machine.parameters.guess)
     matrix = known.least(present.machine, () if base is None else (base,)) * np.outer(slope, slope)

@@ -103,7 +103,17 @@ class UnforcedDesign:
         return out
 
     def __str__(self) -> str:
-        return "\n".join([*self._table(), *self._scale(), *self._second(), *self._extremes()])
+        lines = [*self._fit(), *self._table(), *self._scale(), *self._second(), *self._extremes()]
+        return "\n".join(lines)
+
+    def _fit(self) -> list[str]:
+        """Return the line on a fit of the present logs that did not converge."""
+        if self.result is None or self.result.estimate.converged:
+            return []
+        return [
+            f"the fit of the present logs did not converge: {self.result.estimate.message}",
+            "its values follow the logs, and the design counts on them",
+        ]
 
     def _table(self) -> list[str]:
         """Return a line for each unknown: its expected deviation over its value."""
@@ -159,25 +169,30 @@ class UnforcedDesign:
         return ", ".join(f"{self.machine.parameters.names[k]} {self._part(std, k)}" for k in known)
 
     def _extremes(self) -> list[str]:
-        """Return the lines on the extremes of the motion; for several joints, a table."""
-        peaks, seconds = self.peaks, f"{self.time[-1]:.3g} s from rest"
-        columns = {"from": peaks.low, "to": peaks.high, "speed up to": peaks.speed, "noise": self.noise}
-        joints = len(peaks.low)
-        if joints == 1:
-            low, high, speed, noise = (f"{values[0]:.3g}" for values in columns.values())
-            return [
-                f"{seconds} at {self.values[0, 0]:.3g}, positions from {low} to {high}, speed up to {speed}, "
-                f"command up to {peaks.force[0]:.3g}; noise of a reading {noise}"
-            ]
-        names = self.case.plant.names or tuple(f"joint{k + 1}" for k in range(joints))
-        rows = [["", *columns]]
-        for k, name in enumerate(names):
-            rows.append([name, *(f"{values[k]:.3g}" for values in columns.values())])
-        force = ", ".join(f"{x:.3g}" for x in peaks.force)
-        return [f"{seconds}; commands of the loop up to {force}", aligned(rows), *self._unchecked()]
+        """Return the lines on the extremes of the motion, with a row for each joint."""
+        peaks, joints = self.peaks, len(self.peaks.low)
+        rate = (len(self.time) - 1) / self.time[-1]
+        lines = [f"{self.time[-1]:.3g} s from rest, {rate:.6g} rows a second"]
+        lines.append(f"commands of the loop up to {', '.join(f'{x:.3g}' for x in peaks.force)}")
+
+        start = np.full(joints, np.nan)
+        start[list(self.machine.plant.driven(joints))] = self.values[0]
+        columns = {
+            "start": start,
+            "from": peaks.low,
+            "to": peaks.high,
+            "speed up to": peaks.speed,
+            "noise of a reading": self.noise,
+        }
+        numbered = ("",) if joints == 1 else tuple(f"joint {k + 1}" for k in range(joints))
+        rows = [["motion", *columns]]
+        for k, name in enumerate(self.case.plant.names or numbered):
+            cells = (f"{values[k]:.3g}" if np.isfinite(values[k]) else "-" for values in columns.values())
+            rows.append([name, *cells])
+        return [*lines, aligned(rows), *self._unchecked()]
 
     def _unchecked(self) -> list[str]:
-        """Return the line on what the limits of a robot do not keep it from."""
+        """Return the line on collisions, from which the limits of a robot do not keep it."""
         if not self.case.plant.cls.linked:
             return []
         return ["collisions are not checked: play the command in a simulator of the cell first"]

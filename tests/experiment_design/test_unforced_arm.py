@@ -1,14 +1,23 @@
 """Experiments for an arm whose log holds commands and encoders alone, held against an exact arm."""
 
-import dataclasses
 import tomllib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import jaxid
 from benchmarks.unforced_arms import NOISE, Arm, arm
+from jaxid.build import build_machine
+from jaxid.case.case import load_case
 from jaxid.cli import main
+from jaxid.errors import InputError
+from jaxid.experiment_design.by_trials import Trial, Trials
+from jaxid.experiment_design.second_logs import _loaded_link
+from jaxid.experiment_design.shapes import Shapes
+from jaxid.experiment_design.unforced import _sampling
 from jaxid.first_case.section import toml
 
 SECONDS, RATE, EVERY = 6.0, 500.0, 10
@@ -18,10 +27,10 @@ STROKE, SPEED, ACCELERATION = 0.8, 4.0, 40.0
 def exact(command: np.ndarray, seed: int = 0) -> Arm:
     """An arm of two servos on the exact stepper, under commands a row."""
     drawn = arm(4)
-    servos = tuple(dataclasses.replace(s, effects={**s.effects}) for s in drawn.servos)
+    servos = tuple(replace(s, effects={**s.effects}) for s in drawn.servos)
     for servo, delay in zip(servos, (0.02, 0.03), strict=True):
         servo.effects["command_delay"] = {"delay": delay}
-    return dataclasses.replace(drawn, seed=seed, rate=RATE, every=EVERY, servos=servos, command=command)
+    return replace(drawn, seed=seed, rate=RATE, every=EVERY, servos=servos, command=command)
 
 
 def case(factor: float = 1.0) -> dict:
@@ -66,7 +75,7 @@ def test_it_tells_more_than_a_tour_and_keeps_within_its_limits(found):
     assert np.abs(np.diff(motion[::EVERY], axis=0)).max() * rate <= SPEED
     printed = str(found)
     assert "collisions are not checked" in printed
-    assert "joint2  " in printed
+    assert "joint 2  " in printed
 
 
 @pytest.mark.slow
@@ -110,3 +119,77 @@ def test_it_adds_to_a_log_that_is_there_and_its_files_are_fitted_together(tmp_pa
     true = np.array([exact(signal).truth()[name] for name in result.names])
     assert np.all(np.abs(result.theta - true) < 4 * result.std)
     assert np.prod(result.std / before.std) ** (1 / len(true)) < 0.6
+
+
+TWO_LINKS = """<mujoco><option timestep="0.002"/><worldbody><body name="upper">
+<joint name="shoulder" axis="0 1 0" damping="0.05" frictionloss="0.05" armature="0.01"/>
+<geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3"/>
+<body name="lower" pos="0.2 0 0"><joint name="elbow" axis="0 1 0" damping="0.03" armature="0.005"/>
+<geom type="capsule" fromto="0 0 0 0.15 0 0" size="0.015" mass="0.1"/></body></body></worldbody>
+<actuator><position name="s" joint="shoulder" kp="10" kv="0.5"/>
+<position name="e" joint="elbow" kp="5" kv="0.2"/></actuator></mujoco>"""
+OF_FILE = {
+    "plant": {"kind": "tree", "mjcf": "two.xml", "unknown": ["kp"], "payload_at": {"lower": [0.15, 0, 0]}},
+    "log": {
+        "time": "t",
+        "position": {"shoulder": "q1", "elbow": "q2"},
+        "reference": {"shoulder": "r1", "elbow": "r2"},
+        "reference_hold": "zero_order",
+    },
+    "sensor": {"position_noise": 5e-4},
+    "limits": {"stroke": [-0.8, 0.8], "speed": 4.0},
+    "simulation": {"duration": 1.0, "sample_rate": 49.9},
+}
+
+
+def written(folder: Path, **changes: object) -> Path:
+    """The case of the file, with other tables in place of some."""
+    (folder / "two.xml").write_text(TWO_LINKS)
+    lines = (f"{name} = {toml(table)}\n" for name, table in (OF_FILE | changes).items())
+    (folder / "case.toml").write_text("".join(lines))
+    return folder / "case.toml"
+
+
+def test_a_second_log_has_a_payload_where_the_case_has_a_place_for_it(tmp_path):
+    machine = build_machine(load_case(written(tmp_path)), period=0.02)
+    changes = _loaded_link(machine)
+    # Parts of the 0.4 kg of both links, the larger first.
+    assert [values for _, values, _ in changes] == [{"payload[2]": 0.08}, {"payload[2]": 0.02}]
+    assert "a payload of 0.08 kg at link 2" in changes[0][0]
+    for _, values, loaded in changes:
+        np.testing.assert_allclose(loaded.plant.payload, [0.0, values["payload[2]"]])
+
+    plant = {**OF_FILE["plant"], "parameters": {"payload": {"elbow": {"guess": 0.1}}}}
+    unknown = build_machine(load_case(written(tmp_path, plant=plant)), period=0.02)
+    assert _loaded_link(unknown) == []
+
+
+def test_rows_fall_on_ticks_of_a_loop_whose_rate_nobody_states(tmp_path):
+    case = load_case(written(tmp_path))
+    sampling = _sampling(case, build_machine(case, period=1 / 498.5))
+    assert (sampling.rate, sampling.rows, sampling.every) == (pytest.approx(49.85, rel=1e-12), 50, 10)
+    slow = load_case(written(tmp_path, simulation={"duration": 1.0, "sample_rate": 210.0}))
+    with pytest.raises(InputError, match=r"a loop of 498\.5 Hz cannot be logged at sample_rate = 210"):
+        _sampling(slow, build_machine(slow, period=1 / 498.5))
+
+
+def test_the_case_is_not_written_over(tmp_path, capsys):
+    path = written(tmp_path)
+    before = path.read_text()
+    assert main(["design", str(path), "-o", str(tmp_path / "case.csv"), "--force"]) == 2
+    assert "would be written over" in capsys.readouterr().err
+    assert path.read_text() == before
+
+
+def test_a_mixed_command_takes_the_joints_that_tell_more():
+    plant = SimpleNamespace(driven=lambda n: (0, 1, 2))
+    shapes = Shapes(np.zeros((5, 2)), np.zeros(3), np.ones(3), np.ones(3))
+    present = SimpleNamespace(machine=SimpleNamespace(plant=plant))
+    trials = Trials(present, None, (), None, shapes, 50.0)
+    best, other = (
+        Trial(size * np.arange(1.0, 11.0), None, None, 0.0, np.array(told))
+        for size, told in ((1.0, [3.0, 1.0, 2.0]), (-1.0, [2.0, 4.0, 5.0]))
+    )
+    # Two weights of each joint, the centres, the amplitude.
+    np.testing.assert_array_equal(trials.mixed(best, other), [1, 2, -3, -4, -5, -6, 7, -8, -9, 10])
+    assert trials.mixed(best, replace(other, by_joint=np.zeros(3))) is None
