@@ -31,14 +31,17 @@ def run(args: argparse.Namespace) -> int:
     from jaxid.files import ready_file
 
     path = ready_file(Path(args.o), overwrite=args.force)
+    if path.resolve() in {Path(log).resolve() for log in args.log}:
+        what = f"the signal would be written over {args.o}, a log of the fit"
+        raise InputError(what, where=f"-o {args.o}", hint="choose another name for -o")
     need_sound_case(args)
     from jaxid.case.case import load_case
 
     case = path.with_suffix(".toml") if load_case(args.case).without_force else None
     if case is not None:
         if case.resolve() == Path(args.case).resolve():
-            what = f"its case would be written over {args.case}"
-            raise InputError(what, where=f"-o {args.o}", hint="name the signal otherwise")
+            what = f"the case of the experiment would be written over {args.case}"
+            raise InputError(what, where=f"-o {args.o}", hint="choose another name for -o")
         ready_file(case, overwrite=args.force, suffix=".toml")
     with progress_of(args) as show:
         from jaxid.commands.design import design

@@ -23,11 +23,11 @@ def design(
 ) -> Design | Excitation | UnforcedDesign:
     """Find the reference, or in open loop the input, that identifies the unknowns of a case best.
 
-    For an arm, and for any case with a key in [design], the machine is assumed to follow the reference: see
-    `jaxid.experiment_design.along_reference.excite`. Otherwise gradients through the simulation maximise the
-    logarithm of the determinant of the information matrix at the guesses (D-optimal; Bayesian: each guess is
-    a prior of the relative width `[within_prior] prior`, by default 0.5). Candidates are sums of sines and
-    a tour from end to end, within [limits].
+    For an arm whose force is logged, and for any such case with a key in [design], the machine is assumed to
+    follow the reference: see `jaxid.experiment_design.along_reference.excite`. Otherwise gradients through
+    the simulation maximise the logarithm of the determinant of the information matrix at the guesses
+    (D-optimal; Bayesian: each guess is a prior of the relative width `[within_prior] prior`, by default 0.5).
+    Candidates are sums of sines and a tour from end to end, within [limits].
 
     If the case has a controller and its [log] no force, the information is that of the position of the
     simulated loop, beside that of a log which is given: see `jaxid.experiment_design.unforced`.

@@ -19,6 +19,7 @@ from jaxid.numerics.lanes import Steps
 from jaxid.simulation.noisy_loop import ReadingNoise
 from jaxid.simulation.replay import Numerics
 from jaxid.simulation.sensor_noise import position_noise
+from jaxid.simulation.step_size import TooStiffError
 
 # Ticks beside the best one that are compared, and parts of a row of the log: a command that is held from row
 # to row leaves the cost several minima along the delay.
@@ -99,7 +100,8 @@ def best_ticks_of_joints(
     """Find the tick of each joint's delay at which a loop without noise is nearest to the logs.
 
     The delay of one joint is moved by a tick, while all other unknowns are fitted. Of all joints and both
-    sides, the move is tried that the derivatives promise most of.
+    sides, those moves are tried that the derivatives promise most of. A few moves are made at most: a fit is
+    near before it comes here.
 
     Args:
         machine: Machine of all logs, with its controller.
@@ -184,7 +186,10 @@ class _HeldFits:
 
     def without_noise(self, start: Float[np.ndarray, " p"]) -> Steps[tuple[Float[np.ndarray, " p"], float]]:
         """Return the fit of one run of each loop without noise; see `_fitted`."""
-        return (yield from self._fitted(start, []))
+        try:
+            return (yield from self._fitted(start, []))
+        except TooStiffError:
+            return start, np.inf
 
     def promising(self, theta: Float[np.ndarray, " p"]) -> list[Float[np.ndarray, " p"]]:
         """Return values with the delay of one joint a tick off that promise a better fit, the best first.
@@ -198,13 +203,18 @@ class _HeldFits:
         assert controller is not None, "checked by best_ticks_of_joints"
         at = [part.at(theta) for part in self.parts]
         every = [self.numerics or choose_numerics(m, p.log) for m, p in zip(at, self.parts, strict=True)]
-        scales = [1.0 / position_noise(m, p.log) for m, p in zip(at, self.parts, strict=True)]
+        noises = [position_noise(m, p.log) for m, p in zip(at, self.parts, strict=True)]
+        # A constant reading has no noise that could be estimated, and does not count.
+        scales = [np.where(noise > 0, 1.0 / np.where(noise > 0, noise, 1.0), 0.0) for noise in noises]
         rows = [
             part.widened(scale[:, None] * position_jacobian(m, part.log, numerics), len(theta))
             for m, part, numerics, scale in zip(at, self.parts, every, scales, strict=True)
         ]
         jacobian = np.concatenate([row.reshape(-1, len(theta)) for row in rows])[:, ~delays]
+        if not np.all(np.isfinite(jacobian)):
+            return []
         sizes = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+        lower, upper = self.machine.with_estimate(theta).parameters.bounds
 
         def step(values: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
             gaps = [
@@ -215,6 +225,8 @@ class _HeldFits:
             change = np.linalg.lstsq(jacobian / sizes, gap, rcond=None)[0]
             moved = values.copy()
             moved[~delays] += change / sizes
+            within = (moved >= lower) & (moved <= upper) | delays
+            moved = np.where(within, moved, values)
             return float(np.sum(np.square(gap - jacobian / sizes @ change))), moved
 
         here, _ = step(theta)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from jaxid.errors import InputError
 from jaxid.estimators.apart.joint import joint_of
 from jaxid.estimators.several.parts import Part
+from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.experiment_design.limits import Limits, Peaks, kept_within
 from jaxid.experiment_design.position_information import (
     PositionInformation,
@@ -25,10 +26,11 @@ from jaxid.experiment_design.position_information import (
 )
 from jaxid.experiment_design.present import Present
 from jaxid.experiment_design.shapes import Shapes
+from jaxid.logs.log import Log
 
-# Trials times unknowns, since a trial simulates the arm for each unknown; least number of trials; and the
-# share of trials that are drawn before the best is varied.
-_WORK, _LEAST, _DRAWN = 1600, 20, 0.2
+# Work of all trials, steps of integration times unknowns, since a trial simulates the arm for each unknown;
+# least number of trials; and the share of trials that are drawn before the best is varied.
+_WORK, _LEAST, _DRAWN = 6e6, 20, 0.2
 # Part of the largest speed that a command uses: with a payload the arm goes a little faster.
 _PART_OF_SPEED = 0.95
 # Seed of the draws: the same case gives the same command.
@@ -81,19 +83,37 @@ class Trials:
         machine = self.present.machine
 
         def peaks(signal: Float[np.ndarray, "rows m"]) -> Peaks:
-            return peaks_of(machine, played(machine, signal, self.rate))
+            return peaks_of(machine, self.log(signal))
 
         limits = replace(self.limits, speed=_PART_OF_SPEED * self.limits.speed)
-        kept = kept_within(limits, self.shapes, numbers, peaks)
+        try:
+            kept = kept_within(limits, self.shapes, numbers, peaks)
+        except InputError:
+            # The loop diverges.
+            return None
         if kept is None:
             return None
         numbers, signal, _ = kept
-        part = Part.alone(machine, played(machine, signal, self.rate))
+        part = Part.alone(machine, self.log(signal))
         width = len(machine.parameters.free)
         information = self.known + PositionInformation.of(part, self.present.noise, width)
         guess = np.delete(machine.parameters.guess, list(self.held))
         nats = gained(information.least(machine, self.held), guess)
+        if not np.isfinite(nats):
+            return None
         return Trial(numbers, signal, information, nats, self._by_joint(information))
+
+    def log(self, signal: Float[np.ndarray, "rows m"]) -> Log:
+        """Return the log without noise of a command."""
+        return played(self.present.machine, signal, self.rate, self.present.start)
+
+    def work(self, trial: Trial) -> float:
+        """Return the work of a trial: steps of integration times unknowns."""
+        machine = self.present.machine
+        assert machine.controller is not None, "without a controller there is no loop"
+        log = self.log(trial.signal)
+        ticks = len(trial.signal) / (self.rate * float(machine.controller.period))
+        return ticks * choose_numerics(machine, log).substeps * len(machine.parameters.free)
 
     def _by_joint(self, information: PositionInformation) -> Float[np.ndarray, " n"]:
         """Return the information on the unknowns of each joint, if all others were known [nats]."""
@@ -107,7 +127,7 @@ class Trials:
         return np.array(out)
 
     def mixed(self, best: Trial, other: Trial) -> Float[np.ndarray, " k"] | None:
-        """Return the best command with those joints of another that have more information on themselves.
+        """Return the best command with those joints of another that show their own unknowns better.
 
         Returns:
             Its numbers; None if all joints are those of one of the two.
@@ -153,8 +173,8 @@ class Trials:
 
 def informative_commands(
     trials: Trials, starts: list[np.ndarray], where: str, progress: Callable[[str], None]
-) -> list[Trial]:
-    """Return the tour, and the most informative of all commands that are tried.
+) -> tuple[Trial | None, Trial]:
+    """Return the tour, None if it breaks the limits, and the most informative of all commands tried.
 
     Args:
         trials: Machine, limits and family of commands.
@@ -167,26 +187,31 @@ def informative_commands(
     """
     rng = np.random.default_rng(_SEED)
     progress("evaluating sines and tours")
-    first = [t for t in map(trials.trial, starts) if t is not None]
-    if not first:
+    tour, *others = map(trials.trial, starts)
+    found = [trial for trial in (tour, *others) if trial is not None]
+    for _ in range(_LEAST):
+        # The centre of the stroke may be no place for an arm that sags.
+        if not found and (drawn := trials.trial(trials.drawn(rng))) is not None:
+            found.append(drawn)
+    if not found:
         raise InputError(
             "no experiment within the limits was found",
             where=f"{where}, [limits]",
             hint="widen them, or check the loop's gains: every trial exceeded them, whatever its amplitude",
         )
-    best = max(first, key=lambda t: t.nats)
-    most = max(_LEAST, _WORK // len(trials.present.machine.parameters.free))
+    best = max(found, key=lambda t: t.nats)
+    most = max(_LEAST, int(_WORK / trials.work(best)))
     for count in range(most):
         progress(f"trial {count + 1} of {most}")
-        drawn = count < _DRAWN * most
-        numbers = trials.drawn(rng) if drawn else trials.varied(best.numbers, rng)
+        is_drawn = count < _DRAWN * most
+        numbers = trials.drawn(rng) if is_drawn else trials.varied(best.numbers, rng)
         for other in _with_mixed(trials, best, numbers):
             best = max(best, other, key=lambda t: t.nats)
-    return [first[0], best]
+    return tour, best
 
 
 def _with_mixed(trials: Trials, best: Trial, numbers: np.ndarray) -> Iterator[Trial]:
-    """Try a command, and the best one with the joints at which it has more information."""
+    """Try a command, and the best one with those joints of it that show their own unknowns better."""
     other = trials.trial(numbers)
     if other is None:
         return

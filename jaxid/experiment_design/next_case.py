@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import os
 import tomllib
 from collections.abc import Mapping
@@ -49,6 +50,13 @@ def next_case(design: UnforcedDesign, path: Path) -> str:
 def _added(design: UnforcedDesign, path: Path, tables: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """Return tables to add to a case, by their name: a payload of zero if it has none, and the logs."""
     fits: list[dict[str, Any]] = []
+    taken = {entry.get("name") for entry in tables.get("fit", [])}
+
+    def free(name: str) -> str:
+        """Return the name of a new entry: in a second round the first one is taken."""
+        others = (f"{name} {number}" for number in itertools.count(2))
+        return next(one for one in itertools.chain([name], others) if one not in taken)
+
     if design.result is not None and not tables.get("fit"):
         runs = design.result.session.fits
         for k, run in enumerate(runs):
@@ -57,11 +65,12 @@ def _added(design: UnforcedDesign, path: Path, tables: Mapping[str, Any]) -> dic
             # A table in memory is the log that `identify` is given.
             file = {"log": Path(os.path.relpath(source, path.parent)).as_posix()} if source.is_file() else {}
             fits.append({"name": name, **file})
-    fits.append({"name": DESIGNED, "log": f"{path.stem}_log.csv"})
+    fits.append({"name": free(DESIGNED), "log": f"{path.stem}_log.csv"})
     effects: list[dict[str, Any]] = []
     if design.base is not None and design.second:
         second = design.second[0]
-        fits.append({"name": SECOND, "log": f"{path.stem}_second_log.csv", "set": dict(second.values)})
-        if not any(e["kind"] == AddedMass.kind for e in tables.get("effects", [])):
+        fits.append({"name": free(SECOND), "log": f"{path.stem}_second_log.csv", "set": dict(second.values)})
+        loads = f"{AddedMass.kind}.mass" in second.values
+        if loads and not any(e["kind"] == AddedMass.kind for e in tables.get("effects", [])):
             effects.append({"kind": AddedMass.kind, "mass": 0.0})
     return ({"effects": effects} if effects else {}) | {"fit": fits}

@@ -31,7 +31,7 @@ class PositionInformation:
     """Information of the positions of some logs.
 
     The position has a kink where an unknown delay is a whole number of ticks, and the two sides of it may
-    tell much or little. The side that tells less counts.
+    tell much or little. Of all delays a little shorter, and all a little longer, those count that tell less.
 
     Args:
         matrices: J'J over the variance of a reading, by the unknowns of all logs, on each side of the delays,
@@ -87,23 +87,33 @@ class PositionInformation:
         return out
 
 
-def log_at_rest(machine: Machine, signal: Float[np.ndarray, "rows m"], rate: float) -> Log:
-    """Return a log of a reference, in which the machine rests at its start."""
-    n = machine.plant.joints
-    start = np.zeros(n)
-    start[np.asarray(machine.plant.driven(n))] = signal[0]
+def log_at_rest(
+    machine: Machine, signal: Float[np.ndarray, "rows m"], rate: float, start: Float[np.ndarray, " n"]
+) -> Log:
+    """Return a log of a reference, in which the machine rests at its start.
+
+    Args:
+        machine: The machine.
+        signal: The reference, (rows, m) [m or rad].
+        rate: Rows of the log [Hz].
+        start: Positions at the start, (n,) [m or rad]; joints with a drive start at the reference.
+    """
+    start = np.array(start)
+    start[np.asarray(machine.plant.driven(start.size))] = signal[0]
     rows = len(signal)
     time, force = np.arange(rows) / rate, np.zeros((rows, machine.gain.size))
     return Log(time, np.tile(start, (rows, 1)), force, reference=signal, source="the designed log")
 
 
-def played(machine: Machine, signal: Float[np.ndarray, "rows m"], rate: float) -> Log:
-    """Return the log without noise of a reference that is played, dry friction exact.
+def played(
+    machine: Machine, signal: Float[np.ndarray, "rows m"], rate: float, start: Float[np.ndarray, " n"]
+) -> Log:
+    """Return the log without noise of a reference that is played, dry friction exact; see `log_at_rest`.
 
     Raises:
         InputError: If the loop diverges.
     """
-    log = log_at_rest(machine, signal, rate)
+    log = log_at_rest(machine, signal, rate, start)
     position = np.asarray(_run(_from_rest(machine, log), machine.plant).position)
     if not np.all(np.isfinite(position)):
         what = "the simulated loop diverges"

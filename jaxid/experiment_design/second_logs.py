@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from jaxid.case.case import Case
 from jaxid.effects.inertia import AddedMass
+from jaxid.errors import InputError
 from jaxid.estimators.several.parts import Part
 from jaxid.estimators.unforced import common_scale_group, stated_gains
 from jaxid.experiment_design.limits import Limits
@@ -50,9 +51,17 @@ def second_logs(
         held: Unknowns that are held because nothing gives a scale.
     """
     width, out = len(present.machine.parameters.free), []
-    changes = (*_loaded(case, present.machine), *_loaded_link(present.machine), *_other_gains(case, present))
+    changes = (
+        *_loaded(case, present.machine),
+        *_loaded_link(case, present.machine),
+        *_other_gains(case, present.machine),
+    )
     for what, values, machine in changes:
-        log = played(machine, signal, rate)
+        try:
+            log = played(machine, signal, rate, present.start)
+        except InputError:
+            # Other gains may make the loop unstable.
+            continue
         if limits.broken(peaks_of(machine, log)):
             continue
         part = Part.alone(machine, log)
@@ -82,15 +91,20 @@ def _loaded(case: Case, machine: Machine) -> list[Change]:
     return out
 
 
-def _loaded_link(machine: Machine) -> list[Change]:
-    """Return a robot with payloads that are known where its case has a place for them."""
+def _loaded_link(case: Case, machine: Machine) -> list[Change]:
+    """Return a robot with payloads that are known at the last place that its case names for them.
+
+    A place at the origin of a link is left out: the plant does not hold which link it is.
+    """
     plant = machine.plant
     if not isinstance(plant, LinkTree) or plant.payload is None or plant.payload_position is None:
         return []
     if any(f.path[0] == "payload" for f in machine.parameters.free):
         return []
     carriers = np.flatnonzero(np.any(np.asarray(plant.payload_position) != 0, axis=1))
-    link = int(carriers[-1]) if carriers.size else len(plant.payload) - 1
+    if not carriers.size:
+        return []
+    link, movers = int(carriers[-1]), case.plant.links or case.plant.names
     there, robot = float(plant.payload[link]), float(np.sum(np.asarray(plant.mass)))
     out = []
     for part in sorted(_OF_ROBOT, reverse=True):
@@ -99,17 +113,15 @@ def _loaded_link(machine: Machine) -> list[Change]:
             continue
         loaded = replace(plant, payload=jnp.asarray(plant.payload).at[link].add(mass))
         values = {f"payload[{link + 1}]": there + mass}
-        what = f"a payload of {mass:g} kg at link {link + 1} that is known"
+        what = f"a payload of {mass:g} kg that is known, at the link that {movers[link]} moves"
         out.append((what, values, machine.with_plant(loaded, machine.parameters)))
     return out
 
 
-def _other_gains(case: Case, present: Present) -> list[Change]:
-    """Return the machine with its first stated gain halved and doubled; none if no gain is stated."""
-    machine = present.machine
+def _other_gains(case: Case, machine: Machine) -> list[Change]:
+    """Return the machine with its first stated gain halved and doubled; none if [controller] states none."""
     law, names = machine.controller, stated_gains(machine)
-    # Gains of a robot's file stand in no [controller], where a second log could set them.
-    if law is None or not names or case.controller is None:
+    if law is None or not names or "controller" not in case.tables:
         return []
     out = []
     for factor in _GAINS:

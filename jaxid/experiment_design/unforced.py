@@ -99,15 +99,17 @@ def designed_unforced(
     for one in before:
         known = known + one
     stroke = np.linspace(limits.low, limits.high, rows)
-    blank = Part.alone(machine, replace(log_at_rest(machine, np.zeros((rows, 1)), rate), position=stroke))
+    resting = log_at_rest(machine, np.zeros((rows, 1)), rate, present.start)
+    blank = Part.alone(machine, replace(resting, position=stroke))
     group = common_scale_group(machine, [*present.parts, blank])
     base = base_of(machine, group) if group else None
     held = () if base is None else (base,)
     search = _by_trials if case.plant.cls.linked else _by_gradients
-    signals = search(case, present, sampling, limits, base, known, progress)
+    tour, others = search(case, present, sampling, limits, base, known, progress)
+    signals = others if tour is None else [tour, *others]
 
     progress("computing the expected precision of each")
-    parts = [Part.alone(machine, played(machine, signal, rate)) for signal in signals]
+    parts = [Part.alone(machine, played(machine, signal, rate, present.start)) for signal in signals]
     informed = [known + PositionInformation.of(part, present.noise, width) for part in parts]
     guess = np.delete(machine.parameters.guess, held)
     scores = [gained(one.least(machine, held), guess) for one in informed]
@@ -125,7 +127,7 @@ def designed_unforced(
         group=group,
         base=base,
         std=present.std(whole, held),
-        plain=present.std(informed[0], held),
+        plain=None if tour is None else present.std(informed[0], held),
         before=present.std(known, held) if before else None,
         stating={machine.parameters.names[k]: present.std(whole, (k,)) for k in gains},
         second=second,
@@ -164,12 +166,13 @@ def _by_trials(
     base: int | None,
     known: PositionInformation,
     progress: Callable[[str], None],
-) -> list[Float[np.ndarray, "rows m"]]:
-    """Return the tour and the best command of those that are tried, with the base of a scale held."""
+) -> tuple[Float[np.ndarray, "rows m"] | None, list[Float[np.ndarray, "rows m"]]]:
+    """Return the tour, and the best command of those that are tried; see `_by_gradients`."""
     shapes, starts = _commands(case, present.machine, sampling, limits)
     held = () if base is None else (base,)
     trials = Trials(present, known, held, limits, shapes, sampling.rate)
-    return [trial.signal for trial in informative_commands(trials, starts, case.where, progress)]
+    tour, best = informative_commands(trials, starts, case.where, progress)
+    return None if tour is None else tour.signal, [best.signal]
 
 
 def _by_gradients(
@@ -180,10 +183,15 @@ def _by_gradients(
     base: int | None,
     known: PositionInformation,
     progress: Callable[[str], None],
-) -> list[Float[np.ndarray, "rows m"]]:
-    """Return commands, the tour first, improved by gradients through the smoothed loop."""
+) -> tuple[Float[np.ndarray, "rows m"] | None, list[Float[np.ndarray, "rows m"]]]:
+    """Return the tour, None if it breaks the limits, and commands improved by gradients through the loop.
+
+    The base of a scale that is not known is held.
+    """
     problem = _problem(case, present, sampling, limits, base, known)
-    return informative_signals(problem, case.where, progress, _IMPROVED, _EVALUATIONS)
+    signals = informative_signals(problem, case.where, progress, _IMPROVED, _EVALUATIONS)
+    is_tour = problem.within(problem.starts[0]) is not None
+    return (signals[0], signals[1:]) if is_tour and len(signals) > 1 else (None, signals)
 
 
 def _commands(
@@ -196,7 +204,10 @@ def _commands(
     """
     refuse_impossible(machine.plant, _start(case)[None], f"{case.where}, [simulation] initial_position")
     stated_limit = None if case.design is None else case.design.acceleration
-    acceleration = None if stated_limit is None else np.broadcast_to(stated_limit, machine.gain.shape)
+    acceleration = None
+    if stated_limit is not None:
+        by_joint = np.broadcast_to(stated_limit, machine.plant.joints)
+        acceleration = np.asarray(machine.plant.at_drives(by_joint))
     return family(machine, limits, sampling.rows, 1 / sampling.rate, acceleration)
 
 
@@ -244,7 +255,7 @@ def _problem(
     plant = machine.plant.smoothed(np.asarray(SHARPNESS), np.asarray(float(limits.speed.max())))
     machine = machine.with_plant(plant, machine.parameters)
 
-    memory = choose_numerics(machine, log_at_rest(machine, np.zeros((rows, 1)), sampling.rate))
+    memory = choose_numerics(machine, log_at_rest(machine, np.zeros((rows, 1)), sampling.rate, present.start))
     prior = Prior.of(machine, PRIOR, np.zeros(0))
     slope = prior.slope(machine.parameters.guess)
     matrix = known.least(present.machine, () if base is None else (base,)) * np.outer(slope, slope)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.case.case import Case
+from jaxid.errors import InputError
 from jaxid.experiment_design.limits import Peaks
 from jaxid.files import signal_csv, write_whole
 from jaxid.machine import Machine
@@ -51,7 +52,8 @@ class UnforcedDesign:
         group: Unknowns that may all be multiplied by one factor, whatever the motion.
         base: The one of them that is held; None: something known gives the scale.
         std: Expected standard deviations by this log and the present ones, (p,); NaN: not identifiable.
-        plain: The same for a tour from end to end at several speeds in place of the design, (p,).
+        plain: The same for a tour from end to end at several speeds in place of the design, (p,); None: the
+            tour breaks the limits.
         before: The same by the present logs alone, (p,); None: there are none.
         stating: Expected standard deviations if one unknown of the group were stated, by its name, (p,) each.
         second: Second logs that tell more; the first one is that of `case_text`.
@@ -67,7 +69,7 @@ class UnforcedDesign:
     group: tuple[int, ...]
     base: int | None
     std: Float[np.ndarray, " p"]
-    plain: Float[np.ndarray, " p"]
+    plain: Float[np.ndarray, " p"] | None
     before: Float[np.ndarray, " p"] | None
     stating: Mapping[str, Float[np.ndarray, " p"]]
     second: tuple[SecondLog, ...]
@@ -99,6 +101,9 @@ class UnforcedDesign:
     def save_case(self, path: str | Path) -> Path:
         """Write the case of `case_text` beside the file of the reference, with the suffix .toml."""
         out = Path(path).with_suffix(".toml")
+        if self.case.path is not None and out.resolve() == self.case.path.resolve():
+            what = f"the case of the experiment would be written over {self.case.path}"
+            raise InputError(what, where=str(path), hint="choose another name for the signal")
         write_whole(out, self.case_text(path))
         return out
 
@@ -112,7 +117,7 @@ class UnforcedDesign:
             return []
         return [
             f"the fit of the present logs did not converge: {self.result.estimate.message}",
-            "its values follow the logs, and the design counts on them",
+            "its values follow the logs, and the design uses them",
         ]
 
     def _table(self) -> list[str]:

@@ -15,17 +15,21 @@ from jaxid.case.case import load_case
 from jaxid.cli import main
 from jaxid.errors import InputError
 from jaxid.experiment_design.by_trials import Trial, Trials
+from jaxid.experiment_design.next_case import _added
+from jaxid.experiment_design.present import _follows
 from jaxid.experiment_design.second_logs import _loaded_link
 from jaxid.experiment_design.shapes import Shapes
 from jaxid.experiment_design.unforced import _sampling
+from jaxid.experiment_design.unforced_design import UnforcedDesign
 from jaxid.first_case.section import toml
+from jaxid.logs.log import Log
 
 SECONDS, RATE, EVERY = 6.0, 500.0, 10
 STROKE, SPEED, ACCELERATION = 0.8, 4.0, 40.0
 
 
 def exact(command: np.ndarray, seed: int = 0) -> Arm:
-    """An arm of two servos on the exact stepper, under commands a row."""
+    """Return an arm of two servos on the exact stepper, under commands a row."""
     drawn = arm(4)
     servos = tuple(replace(s, effects={**s.effects}) for s in drawn.servos)
     for servo, delay in zip(servos, (0.02, 0.03), strict=True):
@@ -34,7 +38,7 @@ def exact(command: np.ndarray, seed: int = 0) -> Arm:
 
 
 def case(factor: float = 1.0) -> dict:
-    """The case of that arm, its guesses at the truth times a factor, with limits for an experiment."""
+    """Return the case of that arm, its guesses at the truth times a factor, with limits for an experiment."""
     made = exact(np.zeros((10, 2)))
     tables, true = made.case(), made.truth()
     for k, link in enumerate(tables["plant"]["links"], start=1):
@@ -72,7 +76,7 @@ def test_it_tells_more_than_a_tour_and_keeps_within_its_limits(found):
     assert np.abs(np.diff(command, n=2, axis=0)).max() * rate**2 <= ACCELERATION
     motion = exact(command).run(exact=True)["position"]
     assert np.abs(motion).max() <= 1.02 * STROKE
-    assert np.abs(np.diff(motion[::EVERY], axis=0)).max() * rate <= SPEED
+    assert np.abs(np.diff(motion, axis=0)).max() * RATE <= SPEED
     printed = str(found)
     assert "collisions are not checked" in printed
     assert "joint 2  " in printed
@@ -143,7 +147,7 @@ OF_FILE = {
 
 
 def written(folder: Path, **changes: object) -> Path:
-    """The case of the file, with other tables in place of some."""
+    """Write the case of the file, with other tables in place of some."""
     (folder / "two.xml").write_text(TWO_LINKS)
     lines = (f"{name} = {toml(table)}\n" for name, table in (OF_FILE | changes).items())
     (folder / "case.toml").write_text("".join(lines))
@@ -151,17 +155,20 @@ def written(folder: Path, **changes: object) -> Path:
 
 
 def test_a_second_log_has_a_payload_where_the_case_has_a_place_for_it(tmp_path):
-    machine = build_machine(load_case(written(tmp_path)), period=0.02)
-    changes = _loaded_link(machine)
+    case = load_case(written(tmp_path))
+    changes = _loaded_link(case, build_machine(case, period=0.02))
     # Parts of the 0.4 kg of both links, the larger first.
     assert [values for _, values, _ in changes] == [{"payload[2]": 0.08}, {"payload[2]": 0.02}]
-    assert "a payload of 0.08 kg at link 2" in changes[0][0]
+    assert changes[0][0] == "a payload of 0.08 kg that is known, at the link that elbow moves"
     for _, values, loaded in changes:
         np.testing.assert_allclose(loaded.plant.payload, [0.0, values["payload[2]"]])
 
     plant = {**OF_FILE["plant"], "parameters": {"payload": {"elbow": {"guess": 0.1}}}}
-    unknown = build_machine(load_case(written(tmp_path, plant=plant)), period=0.02)
-    assert _loaded_link(unknown) == []
+    unknown = load_case(written(tmp_path, plant=plant))
+    assert _loaded_link(unknown, build_machine(unknown, period=0.02)) == []
+    # Which link a point at an origin belongs to is not in the plant.
+    at_origin = load_case(written(tmp_path, plant={**OF_FILE["plant"], "payload_at": {"upper": [0, 0, 0]}}))
+    assert _loaded_link(at_origin, build_machine(at_origin, period=0.02)) == []
 
 
 def test_rows_fall_on_ticks_of_a_loop_whose_rate_nobody_states(tmp_path):
@@ -177,19 +184,53 @@ def test_the_case_is_not_written_over(tmp_path, capsys):
     path = written(tmp_path)
     before = path.read_text()
     assert main(["design", str(path), "-o", str(tmp_path / "case.csv"), "--force"]) == 2
-    assert "would be written over" in capsys.readouterr().err
+    assert "the case of the experiment would be written over" in capsys.readouterr().err
+    log = tmp_path / "log.csv"
+    log.write_text("t,q1,q2,r1,r2\n")
+    assert main(["design", str(path), str(log), "-o", str(log), "--force"]) == 2
+    assert "the signal would be written over" in capsys.readouterr().err
+    assert log.read_text() == "t,q1,q2,r1,r2\n"
+    unsaved = SimpleNamespace(case=load_case(path))
+    with pytest.raises(InputError, match="the case of the experiment would be written over"):
+        UnforcedDesign.save_case(unsaved, tmp_path / "case.csv")
     assert path.read_text() == before
 
 
 def test_a_mixed_command_takes_the_joints_that_tell_more():
-    plant = SimpleNamespace(driven=lambda n: (0, 1, 2))
+    # The second of four joints has no drive.
+    plant = SimpleNamespace(driven=lambda n: (0, 2, 3))
     shapes = Shapes(np.zeros((5, 2)), np.zeros(3), np.ones(3), np.ones(3))
     present = SimpleNamespace(machine=SimpleNamespace(plant=plant))
     trials = Trials(present, None, (), None, shapes, 50.0)
     best, other = (
         Trial(size * np.arange(1.0, 11.0), None, None, 0.0, np.array(told))
-        for size, told in ((1.0, [3.0, 1.0, 2.0]), (-1.0, [2.0, 4.0, 5.0]))
+        for size, told in ((1.0, [3.0, 1.0, 1.0, 2.0]), (-1.0, [2.0, 0.0, 4.0, 5.0]))
     )
     # Two weights of each joint, the centres, the amplitude.
     np.testing.assert_array_equal(trials.mixed(best, other), [1, 2, -3, -4, -5, -6, 7, -8, -9, 10])
-    assert trials.mixed(best, replace(other, by_joint=np.zeros(3))) is None
+    assert trials.mixed(best, replace(other, by_joint=np.zeros(4))) is None
+
+
+@pytest.mark.parametrize(
+    ("left", "follows"), [([0.2, 1e-3], True), ([0.2, 0.1], False), ([0.4, 1e-3], False)]
+)
+def test_a_fit_follows_its_log_at_every_joint(left, follows):
+    """The first joint moves by 1 rad, the second is at rest but for 0.5 mrad of noise."""
+    rng = np.random.default_rng(0)
+    readings = np.stack([np.sqrt(2) * np.sin(np.arange(200)), 5e-4 * rng.standard_normal(200)], axis=1)
+    log = Log(np.arange(200) / 50, readings, np.zeros((200, 2)))
+    session = SimpleNamespace(
+        fits=[SimpleNamespace(log=log)],
+        machine=SimpleNamespace(sensor=SimpleNamespace(position_std=5e-4)),
+    )
+    gaps = [SimpleNamespace(simulation=SimpleNamespace(rms=np.array(left)))]
+    result = SimpleNamespace(session=session, gaps=gaps, estimate=SimpleNamespace(theta=np.ones(3)))
+    assert _follows(result) == follows
+
+
+def test_a_second_round_has_a_name_that_is_free(tmp_path):
+    design = SimpleNamespace(result=None, base=None, second=())
+    tables = {"fit": [{"name": "designed"}, {"name": "designed 2"}]}
+    assert _added(design, tmp_path / "next.csv", tables) == {
+        "fit": [{"name": "designed 3", "log": "next_log.csv"}]
+    }

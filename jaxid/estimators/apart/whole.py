@@ -39,7 +39,8 @@ from jaxid.simulation.sensor_noise import position_noise
 # matrix. Two joints over 6 s at 1 kHz have 3e5, and a fit takes seconds; with this much it takes minutes.
 _WORK = 1e7
 # Factors in RMS over the noise: beyond the first a fit is tried again; up to the second the ticks beside its
-# delays are tried, and the mean readings are fitted. A wrong tick and the noise in the loop leave as much.
+# delays are tried, and the mean readings are fitted. A wrong tick, and the noise in the loop, leave up to
+# twice the noise of a reading.
 _FAR, _NEAR = 1.2, 2.0
 # Most times that it is, and the part of its misfit that another time must gain to call for the next.
 _RENEWALS, _NEWS = 3, 0.01
@@ -150,7 +151,9 @@ def _leaves_more_than_noise(fit: Estimate, parts: Sequence[Part], factor: float)
     ends = np.cumsum([part.log.samples for part in parts])[:-1]
     for rows, part in zip(np.split(fit.residual, ends), parts, strict=True):
         floor = position_noise(part.machine, part.log)
-        if np.any(np.sqrt(np.nanmean(np.square(rows), axis=0)) > factor * floor):
+        # A constant reading has no noise that could be estimated.
+        left = np.sqrt(np.nanmean(np.square(rows), axis=0))[floor > 0]
+        if np.any(left > factor * floor[floor > 0]):
             return True
     return False
 
