@@ -34,8 +34,8 @@ _EQUAL, _SAME, _FAR = 6.0, 0.3, 50.0
 # Squared residual without noise, as a multiple of the least one, up to which mean readings are fitted.
 _NEARLY = 1.5
 # Most ticks by which the delays of several joints are moved, and the gain in minus twice the logarithm of the
-# likelihood that calls for another tick.
-_ROUNDS, _GAIN = 6, 4.0
+# likelihood that calls for another tick: the larger of a number and a part of the number of readings.
+_ROUNDS, _GAIN, _PART = 6, 4.0, 0.01
 # Most moves of a delay that are tried in a round.
 _TRIED = 2
 
@@ -119,11 +119,12 @@ def best_ticks_of_joints(
     best, least = yield from fits.without_noise(at_ticks(machine, theta))
     if not np.isfinite(least):
         return theta
+    gain = max(_GAIN, _PART * fits.samples)
     for _ in range(_ROUNDS):
         before = least
         for start in fits.promising(best)[:_TRIED]:
             values, chi = yield from fits.without_noise(start)
-            if chi < least - _GAIN:
+            if chi < least - gain:
                 best, least = values, chi
                 break
         if least == before:
@@ -170,7 +171,7 @@ class _HeldFits:
         nearest = min((fit.plain for fit in others), default=np.inf)
         least = min((fit.chi for fit in others), default=np.inf)
         out = _HeldFit(theta, plain, np.inf)
-        if not np.isfinite(plain) or plain > nearest + self._samples * np.log(_NEARLY):
+        if not np.isfinite(plain) or plain > nearest + self.samples * np.log(_NEARLY):
             return out
         noise: list[ReadingNoise | None] = []
         for _ in range(_RENEWALS):
@@ -238,7 +239,7 @@ class _HeldFits:
         return [moved for left, moved in sorted(moves, key=lambda m: m[0]) if left < here]
 
     @property
-    def _samples(self) -> int:
+    def samples(self) -> int:
         """Number of readings in all logs."""
         return sum(part.log.samples * sum(part.log.measured) for part in self.parts)
 

@@ -190,6 +190,9 @@ class UnforcedDesign:
             "noise of a reading": self.noise,
         }
         numbered = ("",) if joints == 1 else tuple(f"joint {k + 1}" for k in range(joints))
+        lines.append(
+            "noise that goes round the loop is not in the deviations: the fit of the log may print larger ones"
+        )
         rows = [["motion", *columns]]
         for k, name in enumerate(self.case.plant.names or numbered):
             cells = (f"{values[k]:.3g}" if np.isfinite(values[k]) else "-" for values in columns.values())

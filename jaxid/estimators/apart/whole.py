@@ -38,9 +38,8 @@ from jaxid.simulation.sensor_noise import position_noise
 # Largest work of a Jacobian of the whole arm: steps of integration times columns times entries of the mass
 # matrix. Two joints over 6 s at 1 kHz have 3e5, and a fit takes seconds; with this much it takes minutes.
 _WORK = 1e7
-# Factors in RMS over the noise: beyond the first a fit is tried again; up to the second the ticks beside its
-# delays are tried, and the mean readings are fitted. A wrong tick, and the noise in the loop, leave up to
-# twice the noise of a reading.
+# Factors in RMS over the noise: beyond the first a fit is tried again; up to the second the mean readings are
+# fitted, because the noise in the loop leaves so much.
 _FAR, _NEAR = 1.2, 2.0
 # Most times that it is, and the part of its misfit that another time must gain to call for the next.
 _RENEWALS, _NEWS = 3, 0.01
@@ -98,8 +97,9 @@ def whole_steps(
     """Fit all unknowns of an arm at once, from some values and from better ones that the fit leads to.
 
     These are the ticks nearest to its delays, because between two ticks dry friction may hold a fit; while
-    more than noise is left, fits of the joints alone under the forces of the arm in simulation; and, once
-    little more is left, the ticks beside them. The mean readings of the loop with this noise are then fitted.
+    more than noise is left, fits of the joints alone under the forces of the arm in simulation; and the ticks
+    beside them. Where little more than noise is left, the mean readings of the loop with this noise are then
+    fitted.
 
     Args:
         machine: Machine of all logs.
@@ -121,10 +121,12 @@ def whole_steps(
         best = min(best, new, key=_rank)
         if not gained > _NEWS * abs(misfit(best)):
             break
-    if not best.converged or _leaves_more_than_noise(best, parts, _NEAR):
+    if not best.converged:
         return replace(best, notes=(_NOTE, *best.notes))
     ticks = yield from best_ticks_of_joints(machine, parts, best.theta, options.get("numerics"))
     best = min(best, (yield from output_error_steps(machine, parts, start=ticks, **options)), key=_rank)
+    if _leaves_more_than_noise(best, parts, _NEAR):
+        return replace(best, notes=(_NOTE, *best.notes))
     # One run without noise, shifted: the noise of every joint in each run takes ten times as long.
     noisy = yield from fitted_with_noise(machine, parts, best.theta, follows=False, **options)
     best = noisy or best
