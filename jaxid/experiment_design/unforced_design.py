@@ -191,7 +191,7 @@ class UnforcedDesign:
         }
         numbered = ("",) if joints == 1 else tuple(f"joint {k + 1}" for k in range(joints))
         lines.append(
-            "noise that goes round the loop is not in the deviations: the fit of the log may print larger ones"
+            "noise that goes round the loop is not in these: the fit of the log may print larger ones"
         )
         rows = [["motion", *columns]]
         for k, name in enumerate(self.case.plant.names or numbered):
