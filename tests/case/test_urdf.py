@@ -138,6 +138,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("position", [pytest.param('["q1", "q2"]', marks=pytest.mark.slow), BY_NAME])
 def test_base_parameters_and_friction_come_back(folder, position):
     """The log is of a closed form; guesses are those of the file, in which the second mass is doubled."""

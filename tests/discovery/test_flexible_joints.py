@@ -31,6 +31,7 @@ def of_rests(joint):
     return machine, session.fit.data, leaves[moved] / 1000.0
 
 
+@pytest.mark.slow
 def test_the_coupling_shows_what_held_a_load():
     """Its torque reaches the level of 0.1 N m above sliding friction in the joint that has it alone."""
     joint = flexible_joint(1)

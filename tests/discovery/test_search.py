@@ -158,6 +158,7 @@ def test_unlogged_bursts_are_unexplained(tmp_path):
     assert np.mean(seen) >= 0.8
 
 
+@pytest.mark.slow
 def test_an_unlogged_clock_force_is_unexplained(tmp_path):
     setup = unlogged(clock_force=(4.0, 7.3))
     text = case_text(setup, (VISCOUS, COULOMB))

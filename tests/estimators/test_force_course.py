@@ -61,6 +61,7 @@ def test_a_force_of_lines_keeps_them():
     assert deviations(found).max() < 3.0
 
 
+@pytest.mark.slow
 def test_where_both_explain_the_log_the_intervals_hold_both():
     found = identified(FINE, noise=NOISY)
     assert found.session.settings["hold"]["value"] == "linear"

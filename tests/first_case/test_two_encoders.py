@@ -100,6 +100,7 @@ def test_joints_of_a_robots_file_are_no_motor_and_load(log):
     assert choose(columns, "log").load is not None
 
 
+@pytest.mark.slow
 def test_the_case_of_two_encoders_finds_the_truth(log):
     columns = {"q_motor": log["q_motor"], "q_load": log["q_load"], "torque": log["torque"]}
     table = {"t": log["t"], "dq_motor": np.gradient(log["q_motor"], log["t"]), **columns}
