@@ -255,7 +255,7 @@ class _HeldFits:
         end = yield from fit.steps(start, active=moving)
         if not end.converged:
             return end.theta, np.inf
-        # The noise of each log is that of its own residual.
+        # The noise of each log is that of its residual.
         counts = [int(rows.counts.sum()) for rows in end.logs]
         left = [float(np.sum(np.square(rows.residual))) / n for rows, n in zip(end.logs, counts, strict=True)]
         return end.theta, float(np.dot(counts, np.log(np.maximum(left, 1e-300))))

@@ -127,7 +127,7 @@ class Trials:
         return np.array(out)
 
     def mixed(self, best: Trial, other: Trial) -> Float[np.ndarray, " k"] | None:
-        """Return the best command with those joints of another that show their own unknowns better.
+        """Return the best command with those joints of another that show their unknowns better.
 
         Returns:
             Its numbers; None if all joints are those of one of the two.
@@ -211,7 +211,7 @@ def informative_commands(
 
 
 def _with_mixed(trials: Trials, best: Trial, numbers: np.ndarray) -> Iterator[Trial]:
-    """Try a command, and the best one with those joints of it that show their own unknowns better."""
+    """Try a command, and the best one with those joints of it that show their unknowns better."""
     other = trials.trial(numbers)
     if other is None:
         return
