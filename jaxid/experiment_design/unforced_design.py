@@ -123,16 +123,14 @@ class UnforcedDesign:
     def _table(self) -> list[str]:
         """Return a line for each unknown: its expected deviation over its value."""
         columns = {"before": self.before, "expected": self.std, "tour": self.plain}
+        if self.base is None:
+            columns |= {f"second {k}": second.std for k, second in enumerate(self.second, start=1)}
         shown = {name: std for name, std in columns.items() if std is not None}
-        labels = [self._label(k) for k in range(len(self.std))]
-        width = max(len("parameter"), *map(len, labels))
-        head = "  ".join(f"{name:<8}" for name in shown)
-        lines = [f"{'parameter':<{width}}  {head}  (standard deviation over the value)"]
-        for k, label in enumerate(labels):
+        rows = [["parameter", *shown, "(standard deviation over the value)"]]
+        for k in range(len(self.std)):
             if k != self.base:
-                cells = "  ".join(f"{self._part(std, k):<8}" for std in shown.values())
-                lines.append(f"{label:<{width}}  {cells}".rstrip())
-        return lines
+                rows.append([self._label(k), *(self._part(std, k) for std in shown.values()), ""])
+        return [aligned(rows)]
 
     def _label(self, k: int) -> str:
         """Return the name of an unknown; of one without a scale, that of its ratio."""
@@ -163,10 +161,13 @@ class UnforcedDesign:
         return [*lines, *(f"  by a second log with {s.what}: {self._all(s.std)}" for s in self.second)]
 
     def _second(self) -> list[str]:
-        """Return the lines on second logs, if the scale is known without."""
-        if self.base is not None or not self.second:
+        """Return the lines on the columns of second logs, if the scale is known without."""
+        if self.base is not None:
             return []
-        return ["a second log of this motion", *(f"  with {s.what}: {self._all(s.std)}" for s in self.second)]
+        return [
+            f"second {k}: with a second log of this motion, recorded with {second.what}"
+            for k, second in enumerate(self.second, start=1)
+        ]
 
     def _all(self, std: np.ndarray) -> str:
         """Return the deviations of all unknowns that are not stated, in a line."""
