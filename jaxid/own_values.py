@@ -37,12 +37,15 @@ class OwnValues:
         plant: Known values by their places in the plant.
         controller: Known values by the fields of the controller.
         period: Sampling time of the controller in this log [s]; None: that of the machine.
+        declared: Sampling time of the machine's controller for which `period` holds [s]. A fit may choose
+            another one, which is then that of all logs.
     """
 
     log: str
     plant: Mapping[Place, float] = field(default_factory=dict)
     controller: Mapping[str, Any] = field(default_factory=dict)
     period: float | None = None
+    declared: float | None = None
 
     def machine(self, machine: Machine) -> Machine:
         """Return the machine of this log: with its values, and with the unknowns that it shows.
@@ -79,7 +82,8 @@ class OwnValues:
     def _controller(self, controller: Controller | None) -> Controller | None:
         if controller is None or not (self.controller or self.period):
             return controller
-        period = {} if self.period is None else {"period": self.period}
+        chosen = self.declared is not None and controller.period != self.declared
+        period = {} if self.period is None or chosen else {"period": self.period}
         return replace(
             controller, **{name: as_array(value) for name, value in self.controller.items()}, **period
         )
@@ -108,10 +112,11 @@ def own_values(
             controller[key] = _of_controller(case, key, value, where)
         else:
             plant |= _of_plant(machine.plant, given, value, where)
-    own = None
+    own = declared = None
     if machine.controller is not None and case.controller is not None and case.controller.period is None:
-        own = period if abs(period / machine.controller.period - 1) > _SAME_PERIOD else None
-    return OwnValues(name, plant, controller, own)
+        declared = float(machine.controller.period)
+        own = period if abs(period / declared - 1) > _SAME_PERIOD else None
+    return OwnValues(name, plant, controller, own, declared)
 
 
 def _of_controller(case: Case, key: str, value: Any, where: str) -> Any:

@@ -27,6 +27,8 @@ _COURSES = ("zero_order", "band_limited")
 _SAME = 1e-4
 # Most ticks a second.
 _FASTEST = 4000.0
+# Most parts of the shortest row, of which the rows of all logs may be whole multiples.
+_PARTS = 20
 # RMS that a loop leaves without noise, over that of the best one, up to which it may be the best with noise.
 _MAY_BE_BEST = 1.4
 
@@ -36,7 +38,7 @@ class _Loop:
     """A loop and its fit.
 
     Args:
-        ticks: Ticks in a row of the log.
+        ticks: Ticks in a row of the log; of logs with several periods, in their common part (see `_row`).
         course: Course of the command between two rows.
         estimate: The fit.
     """
@@ -60,9 +62,10 @@ class _Loop:
 
 def leaves_rate_open(session: Session) -> bool:
     """Check that a case does not state the period of its servos' loop, and that its logs are slow."""
-    controller, log = session.case.controller, session.fit.log
+    controller = session.case.controller
     unstated = controller is not None and controller.period is None
-    return unstated and _one_period(session) and log.period > SLOW_LOOP
+    slowest = max(run.log.period for run in (session.fit, *session.more))
+    return unstated and _row(session) is not None and slowest > SLOW_LOOP
 
 
 def leaves_course_open(session: Session) -> bool:
@@ -76,6 +79,25 @@ def _one_period(session: Session) -> bool:
     """Check that all logs have the same period, so that a loop has the same ticks in a row of each."""
     first = session.fit.log.period
     return all(abs(run.log.period / first - 1) < _SAME for run in session.more)
+
+
+def _row(session: Session) -> float | None:
+    """Return the longest period of which those of all logs are whole multiples [s]; None: it is too short."""
+    if _one_period(session):
+        return session.fit.log.period
+    periods = [run.log.period for run in (session.fit, *session.more)]
+    for part in range(1, _PARTS + 1):
+        row = min(periods) / part
+        if 1 / row > _FASTEST:
+            break
+        if all(abs(period / row / round(period / row) - 1) < _SAME for period in periods):
+            return row
+    return None
+
+
+def _holds(session: Session, ticks: int) -> bool:
+    """Check that a log has more than one tick of a loop in a row, so that a course between rows counts."""
+    return ticks > 1 or not _one_period(session)
 
 
 def _ticks(session: Session) -> int:
@@ -128,21 +150,21 @@ def with_rate_of_log(session: Session, fitted: Fitted, *, without_noise: bool = 
 def _loops(session: Session, fitted: Callable[[Session], Steps[Estimate]]) -> Steps[list[_Loop]]:
     """Return the loops of all rates and courses that converge."""
     courses = (session.machine.reference_hold,) if _states_course(session) else _COURSES
-    period, open_rate = session.fit.log.period, leaves_rate_open(session)
+    row, open_rate = _row(session), leaves_rate_open(session)
     loops: list[_Loop] = []
 
     def tried(ticks: int, course: str) -> Steps[None]:
-        if open_rate and ticks > 1 and ticks / period > _FASTEST:
+        if open_rate and row is not None and ticks > 1 and ticks / row > _FASTEST:
             return
         estimate = yield from fitted(_at(session, ticks, course))
         if estimate.converged:
             loops.append(_Loop(ticks, course, estimate))
 
     for ticks in _FIRST if open_rate else (_ticks(session),):
-        for course in courses if ticks > 1 else courses[:1]:
+        for course in courses if _holds(session, ticks) else courses[:1]:
             yield from tried(ticks, course)
     best = _best(loops)
-    if open_rate and best is not None and best.ticks > 1:
+    if open_rate and best is not None and _holds(session, best.ticks):
         for ticks in _MORE:
             yield from tried(ticks, best.course)
     return loops
@@ -154,7 +176,9 @@ def _at(session: Session, ticks: int, course: str) -> Session:
     assert machine.controller is not None, "asked of a servo"
     controller = machine.controller
     if leaves_rate_open(session):
-        controller = replace(controller, period=session.fit.log.period / ticks)
+        row = _row(session)
+        assert row is not None, "checked by leaves_rate_open"
+        controller = replace(controller, period=row / ticks)
     return session.with_machine(replace(machine, controller=controller, reference_hold=course))
 
 
@@ -178,7 +202,7 @@ def _said(session: Session, best: _Loop, equal: list[_Loop], loops: list[_Loop])
         equal: Loops that explain the log about as well.
         loops: All loops that were fitted.
     """
-    period = session.fit.log.period if leaves_rate_open(session) else None
+    period = _row(session) if leaves_rate_open(session) else None
     estimate = best.estimate.holding(*(loop.estimate.theta for loop in equal))
     sizes = "; ".join(
         f"{loop.words(period)} {loop.rms:.3g}" for loop in sorted(loops, key=lambda loop: loop.rms)
@@ -191,7 +215,7 @@ def _said(session: Session, best: _Loop, equal: list[_Loop], loops: list[_Loop])
     if period is not None:
         settings["period"] = {"value": f"{period / best.ticks:.6g} s", "reason": reason}
         what = "the period of the servo's loop"
-    if best.ticks > 1:
+    if _holds(session, best.ticks):
         settings["reference_hold"] = {"value": best.course, "reason": reason}
     verb = "is" if period is not None else "are"
     note = f"{what} is not stated: {best.words(period)} {verb} taken; {reason}"

@@ -165,10 +165,35 @@ def test_every_log_of_several_follows_the_course_of_the_command_that_is_tried():
     assert [run.machine(tried.machine).reference_hold for run in tried.fits] == ["zero_order"] * 2
 
 
-def test_logs_of_different_rates_keep_the_period_of_the_first():
+def test_logs_of_several_rates_share_a_loop_whose_period_divides_both_rows():
     drawn = servo(1)
-    slow = {name: column[::2] for name, column in beside(drawn).columns().items()}
-    assert not servo_rate.leaves_rate_open(open_session(without_rate(drawn), [drawn.columns(), slow]))
+    first = drawn.columns()
+    row = first["t"][1] - first["t"][0]
+    for factor, common in ((2.0, row), (1.5, row / 2), (0.75, row / 4)):
+        other = first | {"t": factor * first["t"]}
+        session = open_session(without_rate(drawn), [first, other])
+        assert servo_rate.leaves_rate_open(session)
+        at = servo_rate._at(session, 5, "zero_order")
+        periods = [run.machine(at.machine).controller.period for run in at.fits]
+        assert periods == pytest.approx([common / 5] * 2, rel=1e-6)
+    unlike = first | {"t": 1.0137 * first["t"]}
+    session = open_session(without_rate(drawn), [first, unlike])
+    assert not servo_rate.leaves_rate_open(session)
+    # Then each log has a loop of its rate.
+    periods = [run.machine(session.machine).controller.period for run in session.fits]
+    assert periods == pytest.approx([row, 1.0137 * row], rel=1e-6)
+
+
+@pytest.mark.slow
+def test_one_servo_is_found_in_logs_of_two_rates():
+    """The second log has every second row: one loop explains both."""
+    drawn = servo(1)
+    second = beside(drawn)
+    second = replace(second, command=np.repeat(second.command[::2], 2)[: len(second.command)])
+    slow = {name: column[::2] for name, column in second.columns().items()}
+    result = jaxid.identify(without_rate(drawn), [drawn.columns(), slow])
+    assert result.model_complete
+    check(result, drawn)
 
 
 @pytest.mark.slow
