@@ -70,6 +70,27 @@ class _Sampling:
     every: int
 
 
+@dataclass(frozen=True)
+class _Search:
+    """Hold the settings of a search for commands.
+
+    Args:
+        case: The case.
+        present: The machine, the noise and the present logs.
+        sampling: Rows of the designed log.
+        limits: Limits of the experiment.
+        base: Unknown that is held because nothing gives a scale; None: something does.
+        known: Information of the present logs.
+    """
+
+    case: Case
+    present: Present
+    sampling: _Sampling
+    limits: Limits
+    base: int | None
+    known: PositionInformation
+
+
 def designed_unforced(
     case: Case, result: Identification | None, progress: Callable[[str], None]
 ) -> UnforcedDesign:
@@ -105,8 +126,7 @@ def designed_unforced(
     base = base_of(machine, group) if group else None
     held = () if base is None else (base,)
     search = _by_trials if case.plant.cls.linked else _by_gradients
-    tour, others = search(case, present, sampling, limits, base, known, progress)
-    signals = others if tour is None else [tour, *others]
+    signals, has_tour = search(_Search(case, present, sampling, limits, base, known), progress)
 
     progress("computing the expected precision of each")
     parts = [Part.alone(machine, played(machine, signal, rate, present.start)) for signal in signals]
@@ -127,7 +147,7 @@ def designed_unforced(
         group=group,
         base=base,
         std=present.std(whole, held),
-        plain=None if tour is None else present.std(informed[0], held),
+        plain=present.std(informed[0], held) if has_tour else None,
         before=present.std(known, held) if before else None,
         stating={machine.parameters.names[k]: present.std(whole, (k,)) for k in gains},
         second=second,
@@ -159,39 +179,27 @@ def _limits(case: Case, machine: Machine) -> Limits:
 
 
 def _by_trials(
-    case: Case,
-    present: Present,
-    sampling: _Sampling,
-    limits: Limits,
-    base: int | None,
-    known: PositionInformation,
-    progress: Callable[[str], None],
-) -> tuple[Float[np.ndarray, "rows m"] | None, list[Float[np.ndarray, "rows m"]]]:
-    """Return the tour, and the best command of those that are tried; see `_by_gradients`."""
-    shapes, starts = _commands(case, present.machine, sampling, limits)
-    held = () if base is None else (base,)
-    trials = Trials(present, known, held, limits, shapes, sampling.rate)
-    tour, best = informative_commands(trials, starts, case.where, progress)
-    return None if tour is None else tour.signal, [best.signal]
+    search: _Search, progress: Callable[[str], None]
+) -> tuple[list[Float[np.ndarray, "rows m"]], bool]:
+    """Return the tour and the best command of those that are tried; see `_by_gradients`."""
+    shapes, starts = _commands(search.case, search.present.machine, search.sampling, search.limits)
+    held = () if search.base is None else (search.base,)
+    trials = Trials(search.present, search.known, held, search.limits, shapes, search.sampling.rate)
+    tour, best = informative_commands(trials, starts, search.case.where, progress)
+    found = [best] if tour is None else [tour, best]
+    return [trial.signal for trial in found], tour is not None
 
 
 def _by_gradients(
-    case: Case,
-    present: Present,
-    sampling: _Sampling,
-    limits: Limits,
-    base: int | None,
-    known: PositionInformation,
-    progress: Callable[[str], None],
-) -> tuple[Float[np.ndarray, "rows m"] | None, list[Float[np.ndarray, "rows m"]]]:
-    """Return the tour, None if it breaks the limits, and commands improved by gradients through the loop.
+    search: _Search, progress: Callable[[str], None]
+) -> tuple[list[Float[np.ndarray, "rows m"]], bool]:
+    """Return commands improved by gradients through the loop, and whether the first one is the tour.
 
-    The base of a scale that is not known is held.
+    It is not if the tour breaks the limits.
     """
-    problem = _problem(case, present, sampling, limits, base, known)
-    signals = informative_signals(problem, case.where, progress, _IMPROVED, _EVALUATIONS)
-    is_tour = problem.within(problem.starts[0]) is not None
-    return (signals[0], signals[1:]) if is_tour and len(signals) > 1 else (None, signals)
+    problem = _problem(search)
+    signals = informative_signals(problem, search.case.where, progress, _IMPROVED, _EVALUATIONS)
+    return signals, problem.within(problem.starts[0]) is not None
 
 
 def _commands(
@@ -239,15 +247,10 @@ def _start(case: Case) -> Float[np.ndarray, " n"]:
     return np.broadcast_to(np.asarray(case.simulation.initial_position, float), case.plant.joints)
 
 
-def _problem(
-    case: Case,
-    present: Present,
-    sampling: _Sampling,
-    limits: Limits,
-    base: int | None,
-    known: PositionInformation,
-) -> LoopDesign:
+def _problem(search: _Search) -> LoopDesign:
     """Set up the search for a reference by gradients, with the base of a scale held."""
+    case, present, sampling, limits = search.case, search.present, search.sampling, search.limits
+    base, known = search.base, search.known
     machine = present.machine if base is None else without(present.machine, base)
     shapes, starts = _commands(case, machine, sampling, limits)
     assert machine.controller is not None, "without a controller there is no loop"
