@@ -16,9 +16,10 @@ from jaxid.first_case.columns import NO_TIME_RATE, Chosen, Column
 from jaxid.first_case.joints import lacking_force
 from jaxid.first_case.raw import RawLog
 from jaxid.first_case.section import Section, rounded
+from jaxid.first_case.servo import BANDWIDTH, loop_of_servos
 from jaxid.first_case.units import Measures
 from jaxid.logs.in_memory import LogLike, as_log
-from jaxid.logs.log import SLOW_LOOP, Log
+from jaxid.logs.log import Log
 from jaxid.logs.soundness import position_levels
 from jaxid.logs.units import Frame, parse_unit
 from jaxid.model.units import Units
@@ -28,8 +29,6 @@ from jaxid.settings import Actuator
 _GRAVITY = 9.81
 # Mass times distance of a swing that nothing states [kg m].
 _MOMENT = 0.1
-# Bandwidth of a servo's loop [Hz] and time between its ticks [s] that nothing states.
-_BANDWIDTH, _TICK = 5.0, 1e-3
 # Smallest guesses over the size of the force: friction is positive.
 _LEAST = 0.01
 # Noise beyond that of the rounding, as a variance over it, from which it is stated.
@@ -150,7 +149,7 @@ class Draft:
         log has an absolute scale.
         """
         units, rotary = self._units(), self._measures.motion == "rotary"
-        inertia, rate = (0.01 if rotary else 1.0), 2 * np.pi * _BANDWIDTH
+        inertia, rate = (0.01 if rotary else 1.0), 2 * np.pi * BANDWIDTH
         stroke = float(np.ptp(self._by_hand()[1]))
         table = self._log_table()
         log = self._read(table)
@@ -166,29 +165,12 @@ class Draft:
             keys = {"kind": kind, key: {"guess": rounded(value)}}
             return Section("[[effects]]", keys, {key: units.label(dimension)})
 
-        keys = {
-            "kind": "pd",
-            "kp": {"guess": rounded(inertia * rate**2)},
-            "kd": {"guess": rounded(1.4 * inertia * rate)},
-            "delay": {"guess": 0.02},
-        }
-        if log.period <= SLOW_LOOP:
-            keys["period"] = rounded(log.period / max(round(log.period / _TICK), 1), 9)
-        notes = {"delay": "s, between the command and the loop", "period": "s, of the servo's own loop"}
-        loop = Section("[controller]", keys, notes)
-        loop.assumed.append(
-            "the law is kp times the error and kd times its derivative, or that of the position alone: "
-            "identify compares the two"
-        )
-        loop.questions.append(
-            "at which rate does the servo's own loop run? Then period; else identify finds it"
-        )
         return [
             plant,
             values,
             effect("viscous_friction", "coefficient", 0.3 * inertia * rate, "force*time/position"),
             effect("coulomb_friction", "level", 0.01 * inertia * rate**2 * stroke, "force"),
-            loop,
+            loop_of_servos([inertia], log.period),
             table,
             *self._sensor(log),
         ]
