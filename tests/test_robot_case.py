@@ -163,10 +163,12 @@ def test_a_search_of_servos_and_links_without_a_force_is_refused_at_once(tmp_pat
     for k, n in enumerate("abc", start=2):
         columns |= {f"q_{n}": np.sin(k * t), f"q_ref_{n}": np.sin(k * t + 0.1)}
     log = write_csv(tmp_path / "log.csv", columns)
-    made = RobotCase.of(str(file), [str(log)], search=True)
-    made.tables["plant"]["unknown"] = [*made.tables["plant"]["unknown"], "base"]
+    tables = RobotCase.of(str(file), [str(log)], search=True).tables
+    # The file states neither friction nor springs, which the search may find.
+    assert tables["plant"]["unknown"] == ["kp", "kv", "delay", "forcerange"]
+    tables["plant"]["unknown"] = [*tables["plant"]["unknown"], "base"]
     with pytest.raises(InputError, match="joint by joint, which these 3 joints do not allow"):
-        discover(made.tables, str(log))
+        discover(tables, str(log))
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from jaxid.case.robot import Robot
 from jaxid.case.urdf import read_urdf, read_urdf_tree
 from jaxid.consistency.balance_fit import rough_gains
 from jaxid.errors import InputError
+from jaxid.estimators.apart.joint import mean_inertias
 from jaxid.files import write_whole
 from jaxid.first_case.columns import Chosen, choose, columns_of
 from jaxid.first_case.drafting import Draft
@@ -22,6 +24,7 @@ from jaxid.first_case.gains import with_gains
 from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_robot
 from jaxid.first_case.raw import raw_log
 from jaxid.first_case.section import Section, case_text
+from jaxid.first_case.servo import has_servos, loop_of_servos
 from jaxid.first_case.units import measures_of
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
@@ -30,6 +33,8 @@ from jaxid.session import open_session
 # Values of a robot's file that forces show, and those that a servo's motion along a known reference shows.
 UNKNOWN_OF_FORCES = ("base", "armature", "damping", "frictionloss")
 UNKNOWN_OF_SERVOS = ("damping", "frictionloss", "kp", "kv", "delay", "forcerange")
+# Values of a file without servos that the motion of servos shows: their rotors are not in a URDF.
+UNKNOWN_BESIDE_SERVOS = ("armature", "damping", "frictionloss")
 # Largest standard deviation of a rough gain, as a part of it, for which it is an unknown of a first case.
 _SHOWN = 0.05
 _TITLE = (
@@ -113,6 +118,7 @@ def init(
     mjcf: str | Path | None = None,
     folder: str | Path = ".",
     unknown: Sequence[str] | None = None,
+    search: bool = False,
 ) -> FirstCase:
     """Write a first case from a raw log: columns, units, sensors, and rough guesses of the unknowns.
 
@@ -123,6 +129,8 @@ def init(
         mjcf: MuJoCo model of the robot of the log.
         folder: Folder in which the case will stand, for the path of the robot's file in it.
         unknown: Words of `[plant] unknown` for a robot's file; None: all that a log of its kind shows.
+        search: Whether effects are to be searched for. Friction, springs and rotors of a robot are then
+            unknown only if its file has any, because the search finds what the file lacks.
 
     Raises:
         InputError: If no column is the position or velocity of a joint, there is no force, or nothing else
@@ -152,9 +160,13 @@ def init(
     draft = kind(log, raw, chosen, measures_of(chosen, motion), Path(folder))
     if robot is not None:
         key = "urdf" if mjcf is None else "mjcf"
-        words = (UNKNOWN_OF_FORCES if chosen.force else UNKNOWN_OF_SERVOS) if unknown is None else unknown
-        sections = draft.tree(robot, Path(robot.file), key, chosen.joints, words)
-        if (unit := draft.unit_of_force) and {"base", "all"} & {*words}:
+        unstated_loop = not chosen.force and not has_servos(robot, chosen.joints)
+        if unknown is None:
+            unknown = _unknown(robot, force=bool(chosen.force), own_loop=unstated_loop, search=search)
+        sections = draft.tree(robot, Path(robot.file), key, chosen.joints, unknown)
+        if unstated_loop:
+            sections = _with_loop(sections, len(chosen.joints), raw.source, log, Path(folder))
+        if (unit := draft.unit_of_force) and {"base", "all"} & {*unknown}:
             known, *others = draft.driven
             tried = with_gains(sections, dict.fromkeys(others, 1.0), known, unit)
             shown = _shown_gains(_first_case(raw.source, Path(folder), tried), log, others)
@@ -178,6 +190,53 @@ def _first_case(source: str, folder: Path, sections: Sequence[Section]) -> First
         tuple(line for section in sections for line in section.assumed),
         tuple(line for section in sections for line in section.questions),
     )
+
+
+def _unknown(robot: Robot, *, force: bool, own_loop: bool, search: bool) -> list[str]:
+    """Return the words for the values of a robot's file that are unknown.
+
+    Args:
+        robot: The robot.
+        force: Whether the log has forces.
+        own_loop: Whether the loop of its servos is one of the case, and not of the file.
+        search: See `init`.
+    """
+    words = UNKNOWN_BESIDE_SERVOS if own_loop else UNKNOWN_OF_SERVOS
+    words = UNKNOWN_OF_FORCES if force else words
+    if not search:
+        return [*words]
+    joints = robot.joints
+    stated = {
+        # No URDF has rotors, without which an unknown loop cannot be fitted.
+        "armature": own_loop or any(joint.armature for joint in joints),
+        "damping": any(any(joint.damping) for joint in joints),
+        "frictionloss": any(joint.friction for joint in joints),
+        "stiffness": any(any(joint.spring) for joint in joints),
+    }
+    return [word for word in (*words, "stiffness") if stated.get(word, True)]
+
+
+def _with_loop(
+    sections: Sequence[Section], joints: int, source: str, log: LogLike, folder: Path
+) -> list[Section]:
+    """Return the sections of a robot's case with the unknown loop of its servos.
+
+    The guesses of its gains are those of a loop about the mean inertia of each joint along the log.
+
+    Args:
+        sections: Sections of the case, without a loop.
+        joints: Number of its joints.
+        source: The log, for messages.
+        log: The log.
+        folder: Folder in which the case will stand.
+    """
+    tried = _first_case(source, folder, [*sections, loop_of_servos([1.0] * joints, math.inf)])
+    try:
+        session = open_session(tried.case(), log)
+    except InputError:
+        return [*sections, loop_of_servos([1.0] * joints, math.inf)]  # the next command says what is wrong
+    inertias = mean_inertias(session.machine, session.fit.data)
+    return [*sections, loop_of_servos(inertias.tolist(), session.fit.log.period)]
 
 
 def _shown_gains(first: FirstCase, log: LogLike, joints: Sequence[int]) -> dict[int, float]:

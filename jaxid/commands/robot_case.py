@@ -32,13 +32,13 @@ class RobotCase:
     Args:
         robot: The file.
         log: The log.
-        unknown: Words of `[plant] unknown`; None: all that such a log shows.
+        search: Whether effects are to be searched for, see `init`.
         first: The case, its file names from the current folder on.
     """
 
     robot: Path
     log: str
-    unknown: tuple[str, ...] | None
+    search: bool
     first: FirstCase
 
     @classmethod
@@ -48,7 +48,7 @@ class RobotCase:
         Args:
             robot: The file.
             logs: The logs of the command; the first one shows the columns.
-            search: Whether effects are to be searched for: then only what the file states may be wrong.
+            search: Whether effects are to be searched for, see `init`.
 
         Raises:
             InputError: If there is no log, or the file or the log is unsound.
@@ -56,8 +56,7 @@ class RobotCase:
         path = Path(robot)
         if not logs:
             raise _no_log(path)
-        unknown = _of_file(_read(path)) if search else None
-        return cls(path, logs[0], unknown, _first(path, logs[0], unknown, Path()))
+        return cls(path, logs[0], search, _first(path, logs[0], search, Path()))
 
     @property
     def tables(self) -> dict[str, Any]:
@@ -67,7 +66,7 @@ class RobotCase:
     def save(self, folder: Path) -> Path:
         """Write the case beside a result, file names from there on."""
         path = folder / FIRST_CASE
-        write_whole(path, _first(self.robot, self.log, self.unknown, folder).text)
+        write_whole(path, _first(self.robot, self.log, self.search, folder).text)
         return path
 
     def save_servos(self, result: Identification, folder: Path) -> str:
@@ -84,12 +83,16 @@ class RobotCase:
         if self.robot.suffix.lower() == ".urdf":
             return ""
         from jaxid.commands.export import export, machine_of
+        from jaxid.export.mjcf_drives import servo_elements
         from jaxid.export.servo_replay import replay_servos
 
         stored = folder / "result.json"
         exported, path = export(stored, "mjcf", self.robot), folder / found_file(str(self.robot))
         write_whole(path, exported.content)
         lines = [f"not exported: {note}" for note in exported.notes]
+        if not any(drive.kp is not None for drive in _read(self.robot).drives):
+            elements = " ".join(servo_elements(machine_of(stored)[0]))
+            lines.append(f"not exported: the loop, as the file has no position servos; it is near {elements}")
         lines.append(f"changed {', '.join(exported.changed) or 'nothing'} in {path}")
         if b"file=" in exported.content:
             lines.append(f"it looks for its meshes beside it: copy it to {self.robot.parent}")
@@ -103,7 +106,7 @@ def implied_case(case: CaseLike, log: Logs, *, search: bool = False) -> CaseLike
     Args:
         case: The case, or a robot's file in MJCF or URDF in its place.
         log: The log, or a list of several, of which the first one shows the columns.
-        search: Whether effects are to be searched for, see `RobotCase.of`.
+        search: Whether effects are to be searched for, see `init`.
 
     Raises:
         InputError: If there is no log for a robot's file, or one of the two is unsound.
@@ -113,8 +116,7 @@ def implied_case(case: CaseLike, log: Logs, *, search: bool = False) -> CaseLike
     first = log[0] if isinstance(log, (list, tuple)) and log else log
     if first is None or isinstance(first, (list, tuple)):
         raise _no_log(Path(case))
-    unknown = _of_file(_read(Path(case))) if search else None
-    return _first(Path(case), first, unknown, Path()).tables
+    return _first(Path(case), first, search, Path()).tables
 
 
 def _no_log(robot: Path) -> InputError:
@@ -151,19 +153,7 @@ def _read(path: Path) -> Robot:
     return read_urdf_tree(path) if path.suffix.lower() == ".urdf" else read_mjcf(path)
 
 
-def _first(path: Path, log: LogLike, unknown: tuple[str, ...] | None, folder: Path) -> FirstCase:
+def _first(path: Path, log: LogLike, search: bool, folder: Path) -> FirstCase:
     if path.suffix.lower() == ".urdf":
-        return init(log, urdf=path, unknown=unknown, folder=folder)
-    return init(log, mjcf=path, unknown=unknown, folder=folder)
-
-
-def _of_file(robot: Robot) -> tuple[str, ...]:
-    """Return the words for values that a file states: what it lacks is for the search to find."""
-    joints = robot.joints
-    stated = {
-        "armature": any(joint.armature for joint in joints),
-        "damping": any(any(joint.damping) for joint in joints),
-        "frictionloss": any(joint.friction for joint in joints),
-        "stiffness": any(any(joint.spring) for joint in joints),
-    }
-    return ("base", *(word for word, is_there in stated.items() if is_there))
+        return init(log, urdf=path, search=search, folder=folder)
+    return init(log, mjcf=path, search=search, folder=folder)

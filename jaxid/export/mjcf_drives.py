@@ -134,8 +134,7 @@ class DriveText:
         def of_law(key: str) -> np.ndarray:
             return np.broadcast_to(np.asarray(law[key], dtype=float), (count,))
 
-        kp, kd = (gain * of_law(key) for key in ("kp", "kv" if law["kind"] == "cascade_pd" else "kd"))
-        kp = kp * of_law("kv") if law["kind"] == "cascade_pd" else kp
+        kp, kd = _servo_gains(given)
         if law["kind"] == "pd" and law.get("derivative", "error") == "error" and np.any(kd):
             what = "kd acts on the slope of the error, and kv of a position servo on the velocity alone"
             self.notes.append(f"controller: {what}")
@@ -183,6 +182,36 @@ class DriveText:
         if delay > 0 and int(compiled.actuator_history[index, 1]) == 0:
             values["interp"] = "linear"
         self._set(place, values)
+
+
+def servo_elements(model: Mapping[str, Any]) -> list[str]:
+    """Return the position servos of a result as elements of an MJCF; none if its law is no such servo.
+
+    Args:
+        model: `model` of result.json.
+    """
+    given = model.get("drives") or {}
+    law = given.get("controller")
+    if law is None or law["kind"] not in ("pd", "cascade_pd"):
+        return []
+    names = [model["joints"][joint - 1] for joint in given["joints"]]
+    kp, kd = _servo_gains(given)
+    return [
+        f'<position joint="{name}" kp="{stiffness:.6g}" kv="{damping:.6g}"/>'
+        for name, stiffness, damping in zip(names, kp.tolist(), kd.tolist(), strict=True)
+    ]
+
+
+def _servo_gains(given: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return stiffness and damping of each servo of the drives of a result."""
+    law, gain = given["controller"], np.array(given["gain"])
+
+    def of_law(key: str) -> np.ndarray:
+        return np.broadcast_to(np.asarray(law[key], dtype=float), gain.shape)
+
+    if law["kind"] == "cascade_pd":
+        return gain * of_law("kp") * of_law("kv"), gain * of_law("kv")
+    return gain * of_law("kp"), gain * of_law("kd")
 
 
 def _same(one: float, other: float) -> bool:

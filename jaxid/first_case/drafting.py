@@ -16,7 +16,7 @@ from jaxid.first_case.columns import NO_TIME_RATE, Chosen, Column
 from jaxid.first_case.joints import lacking_force
 from jaxid.first_case.raw import RawLog
 from jaxid.first_case.section import Section, rounded
-from jaxid.first_case.servo import BANDWIDTH, loop_of_servos
+from jaxid.first_case.servo import BANDWIDTH, has_servos, loop_of_servos
 from jaxid.first_case.units import Measures
 from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log
@@ -87,15 +87,17 @@ class Draft:
             unknown: Words for the values that are unknown.
 
         Raises:
-            InputError: If the log has no force, and no reference that position servos of the file follow.
+            InputError: If the log has neither a force nor a reference by joint, or no force where some joints
+                of the file have position servos and others have none.
         """
         measures, chosen = self._measures, self._chosen
         plant = Section("[plant]", {"kind": "tree", key: _relative(path, self._folder)})
         if len(names) < len(robot.free):
             plant.keys["joints"] = list(names)
         servos = {drive.joint for drive in robot.drives if drive.kp is not None}
+        followed = not chosen.force and has_servos(robot, names)
 
-        if not chosen.force and not (chosen.reference and set(names) <= servos):
+        if not chosen.force and not (chosen.reference and (set(names) <= servos or not followed)):
             raise lacking_force(chosen, self._raw.source, of_robot=True)
         if chosen.driven is not None and not robot.drives:
             plant.keys["actuated"] = [names[k] for k in chosen.driven]
@@ -108,8 +110,12 @@ class Draft:
             'which values of the file are right? Take them out of unknown; "none": all are'
         )
 
-        if not chosen.force:
+        if followed:
             plant.assumed.append("no force is logged: the file's position servos follow the reference")
+        elif not chosen.force:
+            plant.assumed.append("no force is logged: a position loop is taken to move each joint")
+            if robot.drives:
+                plant.keys["actuators"] = False
         elif robot.drives and chosen.force[0].meaning.quantity in ("torque", "force", "current"):
             if any(drive.gain != 1.0 or drive.drag or drive.limit for drive in robot.drives):
                 plant.keys["actuators"] = False
@@ -120,14 +126,14 @@ class Draft:
             )
 
         table = self._log_table(names)
-        if not chosen.force:
+        if followed:
             # Between two rows of a log a servo keeps the command that it was sent last.
             table.keys["reference_hold"] = "zero_order"
             table.assumed.append("each command holds until the next one")
         motions = {joint.name: "rotary" if joint.motion == "revolute" else "linear" for joint in robot.joints}
         self._motions = tuple(motions[name] for name in names)
         log = self._read(table)
-        return [plant, table, *(self._sensor(log) if chosen.force else self._sensor_of_servos(log))]
+        return [plant, table, *(self._sensor_of_servos(log) if followed else self._sensor(log))]
 
     def without_force(self) -> list[Section]:
         """Return the case of a servo that follows its reference, or of a free swing under its weight."""

@@ -6,12 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxid.case.robot import Robot
 from jaxid.first_case.section import Section, rounded
 from jaxid.logs.log import SLOW_LOOP
 
 # Bandwidth of a servo's loop [Hz], time between its ticks and delay of its command [s] that nothing states.
 BANDWIDTH = 5.0
 _TICK, _DELAY = 1e-3, 0.02
+
+
+def has_servos(robot: Robot, joints: Sequence[str]) -> bool:
+    """Check whether a robot's file has position servos at any of some joints."""
+    return any(drive.kp is not None and drive.joint in joints for drive in robot.drives)
 
 
 def loop_of_servos(inertias: Sequence[float], period: float) -> Section:

@@ -12,6 +12,7 @@ from jaxid.case.case import read_case
 from jaxid.case.mjcf import read_mjcf
 from jaxid.commands.export import export
 from jaxid.effects import EFFECTS
+from jaxid.export.mjcf_drives import servo_elements
 from jaxid.results.model_json import drives_json, robot_json
 from tests.case.test_mjcf import LOG, PLANT, SERVO
 
@@ -78,6 +79,17 @@ def test_servos_get_gains_range_and_delay(tmp_path):
     cascade["model"]["drives"]["controller"] = {"kind": "cascade_pd", "kp": 20.0, "kv": 3.0, "period": 0.004}
     _, (a, _) = drives_after(tmp_path, cascade)
     assert (a.kp, a.kd) == (60.0, 3.0)
+
+
+@pytest.mark.parametrize("law", ["pd", "cascade_pd"])
+def test_the_loop_of_a_result_can_be_written_as_servos(law):
+    gains = {"kp": [60.0, 20.0], "kd": [2.0, 0.5]} if law == "pd" else {"kp": [30.0, 40.0], "kv": [2.0, 0.5]}
+    drives = {"joints": [2, 1], "gain": [1.0, 2.0], "controller": {"kind": law, **gains}}
+    elements = servo_elements({"joints": ["a", "b"], "drives": drives})
+    assert elements[0] == '<position joint="b" kp="60" kv="2"/>'
+    assert elements[1] == '<position joint="a" kp="40" kv="1"/>'
+    assert servo_elements({"joints": ["a", "b"], "drives": {**drives, "controller": {"kind": "pid"}}}) == []
+    assert servo_elements({"joints": ["a", "b"], "drives": None}) == []
 
 
 def test_motors_get_gear_range_and_delay_and_joints_the_rest(tmp_path):

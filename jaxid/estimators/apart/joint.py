@@ -193,6 +193,15 @@ def links_of(machine: Machine) -> LinkTree:
     return replace(machine.plant, effects=(), rotor_inertia=None)
 
 
+def mean_inertias(machine: Machine, data: Prepared) -> Float[np.ndarray, " n"]:
+    """Return the mean inertia of each joint of an arm along a log, that of its rotor included, (n,)."""
+    plant = machine.plant
+    assert isinstance(plant, LinkTree), "an arm has links"
+    _, links = of_links(links_of(machine), data.q, data.qd, data.qdd)
+    rotors = 0.0 if plant.rotor_inertia is None else gear_squares(plant) * np.asarray(plant.rotor_inertia)
+    return np.mean(np.asarray(links), axis=0) + rotors
+
+
 def gear_squares(plant: Any) -> np.ndarray:
     """Return the square of each joint's gear ratio."""
     return np.ones(plant.joints) if plant.gear_ratio is None else np.asarray(plant.gear_ratio) ** 2
