@@ -122,12 +122,12 @@ def test_noise_that_shakes_a_loop_is_no_missing_physics():
 
 
 @pytest.mark.slow
-def test_an_arm_whose_loops_shake_it_is_complete_at_the_truth():
-    """The excess of its second joint over white noise is 0.155 for a limit of 0.121."""
-    drawn = arm(40_018)
+def arm_at_truth(seed: int, *, gain: float = 1.0):
+    """Return the session of an arm without a force at its true values, or with other gains of position."""
+    drawn = arm(seed)
     case = drawn.case()
-    for name in ("kp", "kd"):
-        case["controller"][name] = [{"guess": getattr(servo, name)} for servo in drawn.servos]
+    case["controller"]["kp"] = [{"guess": gain * servo.kp} for servo in drawn.servos]
+    case["controller"]["kd"] = [{"guess": servo.kd} for servo in drawn.servos]
     case["controller"]["delay"] = [
         {"guess": servo.effects["command_delay"]["delay"]} for servo in drawn.servos
     ]
@@ -136,10 +136,28 @@ def test_an_arm_whose_loops_shake_it_is_complete_at_the_truth():
     for effect in case["effects"]:
         name = {"viscous_friction": "coefficient", "coulomb_friction": "level"}[effect["kind"]]
         effect[name] = {"guess": drawn.servos[effect["joint"] - 1].effects[effect["kind"]][name]}
-    session = open_session(case, drawn.columns())
+    return open_session(case, drawn.columns())
+
+
+def test_an_arm_whose_loops_shake_it_is_complete_at_the_truth():
+    """The excess of its second joint over white noise is 0.155 for a limit of 0.121."""
+    session = arm_at_truth(40_018)
     (gap,) = gaps(session.machine, session.runs)
     found = position_residuals(session.machine, session.fit, gap.simulation)
     assert [r.complete for r in found] == [True, True]
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.8])
+def test_a_search_of_an_arm_that_leaves_more_than_noise_says_what_it_does_not_try(gain):
+    session = arm_at_truth(40_018, gain=gain)
+    machine, names = session.machine, session.machine.parameters.names
+    precision = replace(
+        Precision.unknown(names), covariance=1e-8 * np.eye(len(names)), identifiable=np.ones(len(names), bool)
+    )
+    estimate = Estimate("", machine, machine.parameters.guess, precision, True, "", np.zeros((1, 2)), 1)
+    for search, said in (("found", gain != 1.0), (None, False)):
+        findings = judge(session, estimate, gaps(machine, session.runs), search).findings
+        assert any("elastic or has clearance is not searched for" in line for line in findings) == said
 
 
 @pytest.mark.parametrize("samples", [1, 2, 4])

@@ -40,6 +40,12 @@ _SLIGHT = 0.05
 _MOST = 6
 _SEARCH = "The command jaxid discover searches for what is missing."
 
+# Of an arm without a force, which is searched joint by joint.
+_NO_SPRINGS = (
+    "A drive that is elastic or has clearance is not searched for at a joint of an arm without a force: "
+    "other effects may be named in its place, as an unbalance or a constant force."
+)
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -342,8 +348,11 @@ def _completeness_words(
     )
     lines += _loop_words(session)
     machine = session.machine
-    if search == "none" and not (machine.unforced(session.fit.log) and machine.plant.coupled):
+    by_joint = machine.unforced(session.fit.log) and machine.plant.coupled
+    if search == "none" and not by_joint:
         lines.append(_SEARCH)
+    if search in ("found", "unexplained") and by_joint:
+        lines.append(_NO_SPRINGS)
     return lines
 
 
