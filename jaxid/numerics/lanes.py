@@ -152,8 +152,8 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
 
     Args:
         many: Generators, one for each run.
-        lanes: Runs in one compiled call. A smaller batch is padded, so that one shape serves all, and the
-            bits of a run do not depend on how many others run beside it.
+        lanes: Runs in one compiled call. A smaller batch is padded, so that one shape serves all. On a
+            processor a batch of at most half as many is solved run by run: padding takes as long as runs do.
 
     Returns:
         For each run its result, or the exception that ended it.
@@ -184,7 +184,12 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
         some, groups[key] = groups[key][:most], groups[key][most:]
         if not groups[key]:
             del groups[key]
-        for (k, _), answer in zip(some, _solved(key, [arrays for _, arrays in some], lanes), strict=True):
+        runs = [arrays for _, arrays in some]
+        if key.alone or accelerator() or 2 * len(some) > lanes:
+            answers = _solved(key, runs, lanes)
+        else:
+            answers = [answer for one in runs for answer in _solved(key, [one], 1)]
+        for (k, _), answer in zip(some, answers, strict=True):
             advance(k, answer)
     return [ended[k] for k in range(len(many))]
 

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxid.numerics import lanes
 from jaxid.numerics.lanes import (
     ParallelCalls,
     Precompile,
@@ -90,6 +91,21 @@ def test_a_request_that_is_alone_is_not_stacked():
 
     assert run_batched([estimator(x) for x in (1.0, 2.0, 3.0)], 16) == [2.0, 4.0, 6.0]
     assert shapes == [()] * 3
+
+
+@pytest.mark.parametrize(("on_accelerator", "sizes"), [(False, [4, 1, 1]), (True, [4, 4])])
+def test_few_runs_are_not_padded_on_a_processor(monkeypatch, on_accelerator, sizes):
+    solved, found = lanes._solved, []
+
+    def counted(key, runs, count):
+        found.append(count)
+        return solved(key, runs, count)
+
+    monkeypatch.setattr(lanes, "accelerator", lambda: on_accelerator)
+    monkeypatch.setattr(lanes, "_solved", counted)
+    values = np.arange(6.0)
+    assert run_batched([estimator(x) for x in values], 4) == (2 * values).tolist()
+    assert found == sizes
 
 
 def test_many_together_do_without(seen):
