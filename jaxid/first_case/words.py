@@ -15,7 +15,7 @@ _QUANTITIES: dict[str, str] = {
     "laufzeit zeitpunkt millis micros seconds",
     "position": "q p pos position positions lage stellung weg winkel drehwinkel angle angles ang s hub "
     "displacement encoder enc counts count inkremente increments ticks hoehe height distance dof pose",
-    "velocity": "qd v vel velocity velocities speed rate geschwindigkeit drehzahl omega rpm w",
+    "velocity": "qd v vel velocity velocities speed rate geschwindigkeit drehzahl omega rpm w twist",
     "acceleration": "qdd a acc accel acceleration beschleunigung vdot wdot omegadot",
     "torque": "tau torque torques trq moment drehmoment effort efforts tq mz",
     "force": "force forces kraft thrust schub f",
@@ -28,7 +28,7 @@ _QUANTITIES: dict[str, str] = {
     "passed over": "error err fehler schleppfehler schleppabstand following deviation abweichung vsupply "
     "supply bus battery batterie flag mode activated enabled index idx row rows sample samples counter "
     "zaehler seq function id ud status power leistung energy friction reibung covariance dc "
-    "zwischenkreis",
+    "zwischenkreis gyro gyros gyroscope gyr imu accelerometer magnetometer",
 }
 _ROLES = {
     "reference": "ref reference soll sollwert target desired des cmd command commanded setpoint set goal "
@@ -38,7 +38,7 @@ _ROLES = {
 # Words that say nothing of a joint.
 _NOISE = (
     "joint joints states state js axis achse motor drive antrieb gelenk robot observation msg data est "
-    "estimated of the im am an der die das on at signal channel kanal ch filtered raw n no nr m g l dt"
+    "estimated of the im am an der die das on at signal channel kanal ch filtered raw n no nr m g l dt point"
 )
 # Words that say of a velocity how it moves, and name a joint otherwise.
 _KINDS = ("angular", "linear")
