@@ -112,8 +112,13 @@ def test_motors_of_an_mjcf_are_no_servos(tmp_path):
     path.write_text(MJCF.format('<motor joint="shoulder" gear="3"/><motor joint="elbow" gear="2"/>'))
     first = jaxid.init(moves(), mjcf=path, folder=tmp_path)
     assert first.tables["plant"]["actuators"] is False
-    assert len(first.tables["controller"]["kp"]) == 2
     assert first.case().controller.unknown.keys() >= {"kp", "kd", "delay"}
+    # A rotor of 0.1 kg m^2 adds to the guess of the gain.
+    path.write_text(path.read_text().replace('name="elbow" axis', 'name="elbow" armature="0.1" axis'))
+    heavier = jaxid.init(moves(), mjcf=path, folder=tmp_path)
+    kp = [[entry["guess"] for entry in f.tables["controller"]["kp"]] for f in (first, heavier)]
+    assert kp[1][0] == kp[0][0]
+    assert kp[1][1] - kp[0][1] == pytest.approx(0.1 * (2 * np.pi * 5.0) ** 2, rel=0.06)
 
 
 def test_a_file_with_a_servo_at_one_of_two_joints_is_refused(tmp_path):
