@@ -155,14 +155,14 @@ def identify_many(
     method: str | None = None,
     lanes: int = 16,
 ) -> list[Estimate | Exception]:
-    """Identify the unknowns of one case from each of many logs of one length, in few compiled calls.
+    """Identify the unknowns of one case from each of many logs of one length, side by side.
 
     Args:
         case: The case, its file, or a dict with its tables; or one for each log, with guesses that may
             differ.
         logs: Logs, or their files.
         method: One of `jaxid.names.METHODS`, or a registered one; None: chosen for each case and log.
-        lanes: Number of logs in a compiled call.
+        lanes: Largest number of logs in a compiled call. On a processor few of them are fitted one by one.
 
     Returns:
         The estimate of each log, or the exception that ended its fit, which leaves the other logs alone.

@@ -24,7 +24,7 @@ from jaxid.first_case.gains import with_gains
 from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_robot
 from jaxid.first_case.raw import raw_log
 from jaxid.first_case.section import Section, case_text
-from jaxid.first_case.servo import has_servos, loop_of_servos
+from jaxid.first_case.servo import loop_of_servos, servos_of
 from jaxid.first_case.units import measures_of
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
@@ -33,8 +33,8 @@ from jaxid.session import open_session
 # Values of a robot's file that forces show, and those that a servo's motion along a known reference shows.
 UNKNOWN_OF_FORCES = ("base", "armature", "damping", "frictionloss")
 UNKNOWN_OF_SERVOS = ("damping", "frictionloss", "kp", "kv", "delay", "forcerange")
-# Values of a file without servos that the motion of servos shows: their rotors are not in a URDF.
-UNKNOWN_BESIDE_SERVOS = ("armature", "damping", "frictionloss")
+# Values of a file beside an unknown loop; a URDF has no rotors.
+UNKNOWN_BESIDE_LOOP = ("armature", "damping", "frictionloss")
 # Largest standard deviation of a rough gain, as a part of it, for which it is an unknown of a first case.
 _SHOWN = 0.05
 _TITLE = (
@@ -129,8 +129,9 @@ def init(
         mjcf: MuJoCo model of the robot of the log.
         folder: Folder in which the case will stand, for the path of the robot's file in it.
         unknown: Words of `[plant] unknown` for a robot's file; None: all that a log of its kind shows.
-        search: Whether effects are to be searched for. Friction, springs and rotors of a robot are then
-            unknown only if its file has any, because the search finds what the file lacks.
+        search: Whether effects are to be searched for. Friction and springs are then unknown only if the
+            robot's file has any, because the search finds what the file lacks. Rotors are too, except in an
+            unknown loop. Not used if `unknown` is given.
 
     Raises:
         InputError: If no column is the position or velocity of a joint, there is no force, or nothing else
@@ -160,11 +161,11 @@ def init(
     draft = kind(log, raw, chosen, measures_of(chosen, motion), Path(folder))
     if robot is not None:
         key = "urdf" if mjcf is None else "mjcf"
-        unstated_loop = not chosen.force and not has_servos(robot, chosen.joints)
+        own_loop = not chosen.force and not servos_of(robot, chosen.joints)
         if unknown is None:
-            unknown = _unknown(robot, force=bool(chosen.force), own_loop=unstated_loop, search=search)
+            unknown = _unknown(robot, force=bool(chosen.force), own_loop=own_loop, search=search)
         sections = draft.tree(robot, Path(robot.file), key, chosen.joints, unknown)
-        if unstated_loop:
+        if own_loop:
             sections = _with_loop(sections, len(chosen.joints), raw.source, log, Path(folder))
         if (unit := draft.unit_of_force) and {"base", "all"} & {*unknown}:
             known, *others = draft.driven
@@ -201,7 +202,7 @@ def _unknown(robot: Robot, *, force: bool, own_loop: bool, search: bool) -> list
         own_loop: Whether the loop of its servos is one of the case, and not of the file.
         search: See `init`.
     """
-    words = UNKNOWN_BESIDE_SERVOS if own_loop else UNKNOWN_OF_SERVOS
+    words = UNKNOWN_BESIDE_LOOP if own_loop else UNKNOWN_OF_SERVOS
     words = UNKNOWN_OF_FORCES if force else words
     if not search:
         return [*words]
@@ -293,7 +294,7 @@ def _need_loadable(first: FirstCase, chosen: Chosen) -> None:
     try:
         first.case()
     except InputError as error:
-        if chosen.force and chosen.position:
+        if chosen.position and (chosen.force or chosen.reference):
             raise
         what, hint = (
             "the log has no position, and velocities alone are not fitted yet",

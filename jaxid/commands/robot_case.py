@@ -83,16 +83,15 @@ class RobotCase:
         if self.robot.suffix.lower() == ".urdf":
             return ""
         from jaxid.commands.export import export, machine_of
-        from jaxid.export.mjcf_drives import servo_elements
+        from jaxid.export.mjcf_drives import servo_words
         from jaxid.export.servo_replay import replay_servos
 
         stored = folder / "result.json"
         exported, path = export(stored, "mjcf", self.robot), folder / found_file(str(self.robot))
         write_whole(path, exported.content)
         lines = [f"not exported: {note}" for note in exported.notes]
-        if not any(drive.kp is not None for drive in _read(self.robot).drives):
-            elements = " ".join(servo_elements(machine_of(stored)[0]))
-            lines.append(f"not exported: the loop, as the file has no position servos; it is near {elements}")
+        if "controller" in self.tables:
+            lines += [f"not exported: {line}" for line in servo_words(machine_of(stored)[0])]
         lines.append(f"changed {', '.join(exported.changed) or 'nothing'} in {path}")
         if b"file=" in exported.content:
             lines.append(f"it looks for its meshes beside it: copy it to {self.robot.parent}")

@@ -15,6 +15,7 @@ from jaxid.export.xml_text import Element, XmlText
 
 # Relative change below which a value of the file stays as it is written.
 _SAME = 1e-12
+_SLOPE_OF_ERROR = "kd acts on the slope of the error, and kv of a position servo on the velocity alone"
 # Effects of drives that are written here.
 DRIVE_EFFECTS = ("back_emf_damping", "saturation", "actuator_lag", "input_delay", "actuator_gain")
 
@@ -135,9 +136,8 @@ class DriveText:
             return np.broadcast_to(np.asarray(law[key], dtype=float), (count,))
 
         kp, kd = _servo_gains(given)
-        if law["kind"] == "pd" and law.get("derivative", "error") == "error" and np.any(kd):
-            what = "kd acts on the slope of the error, and kv of a position servo on the velocity alone"
-            self.notes.append(f"controller: {what}")
+        if _of_the_error(law) and np.any(kd):
+            self.notes.append(f"controller: {_SLOPE_OF_ERROR}")
         for name, stiffness, damping in zip(names, kp.tolist(), kd.tolist(), strict=True):
             self._gains(elements[name], drives[name], stiffness, damping)
         if law.get("limit") is not None:
@@ -184,11 +184,14 @@ class DriveText:
         self._set(place, values)
 
 
-def servo_elements(model: Mapping[str, Any]) -> list[str]:
-    """Return the position servos of a result as elements of an MJCF; none if its law is no such servo.
+def servo_words(model: Mapping[str, Any]) -> list[str]:
+    """Return sentences on the position servos that stand for the loop of a result.
 
     Args:
         model: `model` of result.json.
+
+    Returns:
+        The servos as elements of an MJCF, with all that these do not hold; empty if its law is no such servo.
     """
     given = model.get("drives") or {}
     law = given.get("controller")
@@ -196,10 +199,23 @@ def servo_elements(model: Mapping[str, Any]) -> list[str]:
         return []
     names = [model["joints"][joint - 1] for joint in given["joints"]]
     kp, kd = _servo_gains(given)
-    return [
+    elements = [
         f'<position joint="{name}" kp="{stiffness:.6g}" kv="{damping:.6g}"/>'
         for name, stiffness, damping in zip(names, kp.tolist(), kd.tolist(), strict=True)
     ]
+    lines = [f"the loop, for which the file has no position servos; add {' '.join(elements)}"]
+    if law.get("delay") is not None:
+        delays = np.broadcast_to(np.asarray(law["delay"], dtype=float), kp.shape)
+        listed = ", ".join(f"{1e3 * delay:.3g} ms" for delay in delays.tolist())
+        lines.append(f"the delay of the command of each servo: {listed}")
+    if _of_the_error(law) and np.any(kd):
+        lines.append(_SLOPE_OF_ERROR)
+    return lines
+
+
+def _of_the_error(law: Mapping[str, Any]) -> bool:
+    """Check whether a law differentiates the error of the position."""
+    return law["kind"] == "pd" and law.get("derivative", "error") == "error"
 
 
 def _servo_gains(given: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:

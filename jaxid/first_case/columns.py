@@ -394,6 +394,9 @@ def _bare_command(column: Column, position: Mapping[str, Column]) -> bool:
     """Check for a wanted value without a quantity that no position follows: the drive's command."""
     if column.meaning.quantity or not column.meaning.reference:
         return False
+    joint = " ".join(column.meaning.joint)
+    if not column.moves and all(position) and joint and joint not in position:
+        return False  # the command of another joint, at rest
     return not any(abs(correlation(column.values, p.values)) > _FOLLOWED for p in position.values())
 
 

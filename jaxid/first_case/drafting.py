@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from jaxid.case.robot import Robot
+from jaxid.errors import InputError
 from jaxid.first_case.balance import FreeSwing, RoughBalance, free_swing, rough_balance
 from jaxid.first_case.columns import NO_TIME_RATE, Chosen, Column
 from jaxid.first_case.joints import lacking_force
 from jaxid.first_case.raw import RawLog
 from jaxid.first_case.section import Section, rounded
-from jaxid.first_case.servo import BANDWIDTH, has_servos, loop_of_servos
+from jaxid.first_case.servo import BANDWIDTH, loop_of_servos, servos_of
 from jaxid.first_case.units import Measures
 from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log
@@ -87,18 +88,18 @@ class Draft:
             unknown: Words for the values that are unknown.
 
         Raises:
-            InputError: If the log has neither a force nor a reference by joint, or no force where some joints
-                of the file have position servos and others have none.
+            InputError: If the log has neither the forces nor the commands of all joints, or no forces where
+                some joints of the file have position servos and others none; or its positions are counts.
         """
         measures, chosen = self._measures, self._chosen
         plant = Section("[plant]", {"kind": "tree", key: _relative(path, self._folder)})
         if len(names) < len(robot.free):
             plant.keys["joints"] = list(names)
-        servos = {drive.joint for drive in robot.drives if drive.kp is not None}
-        followed = not chosen.force and has_servos(robot, names)
-
-        if not chosen.force and not (chosen.reference and (set(names) <= servos or not followed)):
-            raise lacking_force(chosen, self._raw.source, of_robot=True)
+        self._need_angles(robot)
+        served = servos_of(robot, names)
+        if not chosen.force:
+            self._need_commands(robot, names, served)
+        followed = not chosen.force and bool(served)
         if chosen.driven is not None and not robot.drives:
             plant.keys["actuated"] = [names[k] for k in chosen.driven]
         plant.keys["unknown"] = [*unknown]
@@ -116,6 +117,7 @@ class Draft:
             plant.assumed.append("no force is logged: a position loop is taken to move each joint")
             if robot.drives:
                 plant.keys["actuators"] = False
+                plant.assumed.append("the file's actuators are left out, with their limits")
         elif robot.drives and chosen.force[0].meaning.quantity in ("torque", "force", "current"):
             if any(drive.gain != 1.0 or drive.drag or drive.limit for drive in robot.drives):
                 plant.keys["actuators"] = False
@@ -134,6 +136,34 @@ class Draft:
         self._motions = tuple(motions[name] for name in names)
         log = self._read(table)
         return [plant, table, *(self._sensor_of_servos(log) if followed else self._sensor(log))]
+
+    def _need_angles(self, robot: Robot) -> None:
+        """Refuse positions in a unit of which nothing says the size: the links of a file need angles."""
+        unit = self._measures.labels.get("position")
+        if unit is not None:
+            name = self._chosen.position[0].name
+            raise InputError(
+                f"'{name}' is in {unit}, and the links of {robot.file} need rad or m",
+                where=self._raw.source,
+                hint="convert the column to deg, and name it so, as q1_deg; or write the case by hand with "
+                "counts_per_revolution in [log]",
+            )
+
+    def _need_commands(self, robot: Robot, names: Sequence[str], served: Sequence[str]) -> None:
+        """Refuse a log without forces that has no command for each joint, or servos in the file for some."""
+        chosen, where = self._chosen, self._raw.source
+        if not chosen.position:
+            what = "the log has neither forces nor positions"
+            raise InputError(what, where=where, hint="log the position of each joint")
+        if not chosen.reference or (chosen.loose_forces and not served):
+            raise lacking_force(chosen, where, of_robot=True)
+        if served and len(served) < len(names):
+            without = ", ".join(f"'{name}'" for name in names if name not in served)
+            raise InputError(
+                f"the log has no force, and {robot.file} has no position servo at {without}",
+                where=where,
+                hint="log the forces, or take the position servos out of the file: each loop is then unknown",
+            )
 
     def without_force(self) -> list[Section]:
         """Return the case of a servo that follows its reference, or of a free swing under its weight."""
@@ -317,7 +347,7 @@ class Draft:
 
     def _sensor(self, log: Log | None) -> list[Section]:
         """Return [sensor]: counts of the encoders, and the noise beyond them."""
-        if log is None or log.resampled:
+        if log is None or log.resampled or not self._chosen.position:
             # Resampled positions lie on no steps, and their noise is another one.
             return []
         section = Section("[sensor]")
@@ -339,7 +369,7 @@ class Draft:
 
     def _sensor_of_servos(self, log: Log) -> list[Section]:
         """Return [sensor] for servos of a robot's file, which read their joints exactly, as in MuJoCo."""
-        if log.resampled:
+        if log.resampled or not self._chosen.position:
             return []
         counts = np.array([self._count(column) for column in self._chosen.position])
         noise = np.maximum(np.atleast_1d(high_band_std(log.position)), counts / np.sqrt(12))

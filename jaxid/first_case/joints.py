@@ -13,6 +13,10 @@ from jaxid.first_case.columns import Chosen, Column
 from jaxid.first_case.words import meaning_of
 
 NO_FORCE_HINT = "log the torque or the current of the drives with its sign, and name it so"
+_OR_COMMANDS_HINT = (
+    "log the torque or the current of the drives with its sign, or the commanded position of each joint, and "
+    "name them by the joint, as elbow_torque or elbow_cmd"
+)
 _BY_JOINT_HINT = (
     "name each force by its joint, as elbow_torque; or write the case by hand, where actuated = [...] in "
     "[plant] lists the joints with a force"
@@ -181,7 +185,7 @@ def lacking_force(chosen: Chosen, where: str, *, of_robot: bool = False) -> Inpu
         where: The log, for messages.
         of_robot: Whether the joints are those of a robot's file.
     """
-    hint = NO_FORCE_HINT
+    hint = _OR_COMMANDS_HINT if of_robot else NO_FORCE_HINT
     if chosen.loose_forces:
         hint = _BY_JOINT_HINT if of_robot else _SOME_FORCES_HINT
     return InputError(no_force(chosen), where=where, hint=hint)

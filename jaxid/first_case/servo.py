@@ -13,28 +13,33 @@ from jaxid.logs.log import SLOW_LOOP
 # Bandwidth of a servo's loop [Hz], time between its ticks and delay of its command [s] that nothing states.
 BANDWIDTH = 5.0
 _TICK, _DELAY = 1e-3, 0.02
+# Least inertia of a guess, as a part of the largest.
+_LEAST = 1e-3
 
 
-def has_servos(robot: Robot, joints: Sequence[str]) -> bool:
-    """Check whether a robot's file has position servos at any of some joints."""
-    return any(drive.kp is not None and drive.joint in joints for drive in robot.drives)
+def servos_of(robot: Robot, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return those of some joints at which a robot's file has a position servo."""
+    served = {drive.joint for drive in robot.drives if drive.kp is not None}
+    return tuple(joint for joint in joints if joint in served)
 
 
 def loop_of_servos(inertias: Sequence[float], period: float) -> Section:
     """Return [controller] with the gains of a loop of 5 Hz about each inertia, and an unknown delay.
 
     Args:
-        inertias: What each servo moves [kg m^2 or kg].
+        inertias: What each servo moves [kg m^2 or kg]; the guess for one that moves nothing is small.
         period: Time between two rows of the log [s].
     """
-    rate = 2 * np.pi * BANDWIDTH
+    rate, least = 2 * np.pi * BANDWIDTH, _LEAST * max(inertias, default=0.0) or 1.0
+    inertias = [max(inertia, least) for inertia in inertias]
     keys = {
         "kind": "pd",
         "kp": _guesses([rounded(inertia * rate**2) for inertia in inertias]),
         "kd": _guesses([rounded(1.4 * inertia * rate) for inertia in inertias]),
         "delay": _guesses([_DELAY] * len(inertias)),
     }
-    if period <= SLOW_LOOP:
+    stated = period <= SLOW_LOOP
+    if stated:
         keys["period"] = rounded(period / max(round(period / _TICK), 1), 9)
     notes = {"delay": "s, between the command and the loop", "period": "s, of the servo's own loop"}
     loop = Section("[controller]", keys, notes)
@@ -42,7 +47,12 @@ def loop_of_servos(inertias: Sequence[float], period: float) -> Section:
         "the law is kp times the error and kd times its derivative, or that of the position alone: "
         "identify compares the two"
     )
-    loop.questions.append("at which rate does the servo's own loop run? Then period; else identify finds it")
+    question = "at which rate does the servo's own loop run?"
+    if stated:
+        loop.assumed.append("the servo's own loop runs at about 1 kHz")
+        loop.questions.append(f"{question} State 1 / rate as period")
+    else:
+        loop.questions.append(f"{question} Then period; else identify finds it")
     return loop
 
 

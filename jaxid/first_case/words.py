@@ -15,7 +15,7 @@ _QUANTITIES: dict[str, str] = {
     "laufzeit zeitpunkt millis micros seconds",
     "position": "q p pos position positions lage stellung weg winkel drehwinkel angle angles ang s hub "
     "displacement encoder enc counts count inkremente increments ticks hoehe height distance dof pose",
-    "velocity": "qd v vel velocity velocities speed rate geschwindigkeit drehzahl omega rpm w twist",
+    "velocity": "qd v vel velocity velocities speed rate geschwindigkeit drehzahl omega rpm w",
     "acceleration": "qdd a acc accel acceleration beschleunigung vdot wdot omegadot",
     "torque": "tau torque torques trq moment drehmoment effort efforts tq mz",
     "force": "force forces kraft thrust schub f",
@@ -28,7 +28,7 @@ _QUANTITIES: dict[str, str] = {
     "passed over": "error err fehler schleppfehler schleppabstand following deviation abweichung vsupply "
     "supply bus battery batterie flag mode activated enabled index idx row rows sample samples counter "
     "zaehler seq function id ud status power leistung energy friction reibung covariance dc "
-    "zwischenkreis gyro gyros gyroscope gyr imu accelerometer magnetometer",
+    "zwischenkreis gyro gyros gyroscope gyr accelerometer magnetometer",
 }
 _ROLES = {
     "reference": "ref reference soll sollwert target desired des cmd command commanded setpoint set goal "
@@ -207,6 +207,10 @@ class _Words:
         quantities, joint = self._said(), list(self.joint)
         if quantities == ["load"] and self.symbol in _TURNS:
             quantities = ["position", "load"]  # theta_load is the angle of a load
+        if "twist" in joint and self.kinds and not self.quantities:
+            # The message of a velocity, as twist.angular.z; by itself it may be an angle.
+            quantities = ["velocity"]
+            joint.remove("twist")
         if not quantities and len(joint) == 1 and joint[0] in _AXES:
             quantities = ["position"]
         moved = [q for q in quantities if q in _MOTION]

@@ -153,7 +153,8 @@ def run_batched(many: Sequence[Steps[T]], lanes: int) -> list[T | Exception]:
     Args:
         many: Generators, one for each run.
         lanes: Runs in one compiled call. A smaller batch is padded, so that one shape serves all. On a
-            processor a batch of at most half as many is solved run by run: padding takes as long as runs do.
+            processor a batch of at most half as many is solved run by run, because a padded run takes as long
+            as a real one. The last bits of a run thus depend on those beside it.
 
     Returns:
         For each run its result, or the exception that ended it.

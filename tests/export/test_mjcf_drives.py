@@ -12,7 +12,7 @@ from jaxid.case.case import read_case
 from jaxid.case.mjcf import read_mjcf
 from jaxid.commands.export import export
 from jaxid.effects import EFFECTS
-from jaxid.export.mjcf_drives import servo_elements
+from jaxid.export.mjcf_drives import servo_words
 from jaxid.results.model_json import drives_json, robot_json
 from tests.case.test_mjcf import LOG, PLANT, SERVO
 
@@ -84,12 +84,18 @@ def test_servos_get_gains_range_and_delay(tmp_path):
 @pytest.mark.parametrize("law", ["pd", "cascade_pd"])
 def test_the_loop_of_a_result_can_be_written_as_servos(law):
     gains = {"kp": [60.0, 20.0], "kd": [2.0, 0.5]} if law == "pd" else {"kp": [30.0, 40.0], "kv": [2.0, 0.5]}
-    drives = {"joints": [2, 1], "gain": [1.0, 2.0], "controller": {"kind": law, **gains}}
-    elements = servo_elements({"joints": ["a", "b"], "drives": drives})
-    assert elements[0] == '<position joint="b" kp="60" kv="2"/>'
-    assert elements[1] == '<position joint="a" kp="40" kv="1"/>'
-    assert servo_elements({"joints": ["a", "b"], "drives": {**drives, "controller": {"kind": "pid"}}}) == []
-    assert servo_elements({"joints": ["a", "b"], "drives": None}) == []
+    controller = {"kind": law, **gains, "delay": [0.002, 0.0]}
+    drives = {"joints": [2, 1], "gain": [1.0, 2.0], "controller": controller}
+    model = {"joints": ["a", "b"], "drives": drives}
+    elements, delays, *slope = servo_words(model)
+    assert elements.endswith('<position joint="b" kp="60" kv="2"/> <position joint="a" kp="40" kv="1"/>')
+    assert delays.endswith("2 ms, 0 ms")
+    assert len(slope) == (1 if law == "pd" else 0)
+    drives["controller"] = {**controller, "derivative": "velocity"}
+    assert len(servo_words(model)) == 2
+    drives["controller"] = {"kind": "pid"}
+    assert servo_words(model) == []
+    assert servo_words({**model, "drives": None}) == []
 
 
 def test_motors_get_gear_range_and_delay_and_joints_the_rest(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 
 import jaxid
 from jaxid.errors import InputError
+from jaxid.first_case.servo import loop_of_servos
 from truth.arm.servos import Links, Servo, run
 
 LINKS = Links(mass=(0.3, 0.15), along=(0.1, 0.075), across=(0.0, 0.0), about=(1.25e-3, 3.55e-4), length=0.2)
@@ -124,14 +125,47 @@ def test_motors_of_an_mjcf_are_no_servos(tmp_path):
 def test_a_file_with_a_servo_at_one_of_two_joints_is_refused(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text(MJCF.format('<position joint="shoulder" kp="3"/><motor joint="elbow"/>'))
-    with pytest.raises(InputError, match="no column is a force"):
+    with pytest.raises(InputError, match="no position servo at 'elbow'"):
         jaxid.init(moves(), mjcf=path, folder=tmp_path)
 
 
 def test_commands_of_one_of_two_joints_are_not_enough(robot, tmp_path):
     log = {name: x for name, x in moves().items() if name != "cmd2"}
-    with pytest.raises(InputError, match="no column is a force"):
+    with pytest.raises(InputError, match="or the commanded position of each joint"):
         jaxid.init(log, urdf=robot, folder=tmp_path)
+
+
+def test_forces_of_some_joints_are_not_dropped(robot, tmp_path):
+    log = moves() | {"shoulder_torque": np.cos(7 * moves()["t"])}
+    with pytest.raises(InputError, match="not each has a force: 'shoulder_torque'"):
+        jaxid.init(log, urdf=robot, folder=tmp_path)
+
+
+def test_counts_are_no_angles_of_links(robot, tmp_path):
+    log = {name: x if name == "t" else np.round(2048 + x / COUNT) for name, x in moves().items()}
+    with pytest.raises(InputError, match="'q1' is in count, and the links of .*arm.urdf need rad"):
+        jaxid.init(log, urdf=robot, folder=tmp_path)
+
+
+def test_a_joint_at_rest_has_a_command_and_no_force(robot, tmp_path):
+    log, still = moves(), np.full(len(moves()["t"]), 0.3)
+    names = {"shoulder_pos": log["q1"], "elbow_pos": still, "shoulder_cmd": log["cmd1"], "elbow_cmd": still}
+    first = jaxid.init({"t": log["t"], **names}, urdf=robot, folder=tmp_path)
+    assert "force" not in first.tables["log"]
+    assert first.tables["log"]["reference"] == {"shoulder": "shoulder_cmd"}
+    assert first.tables["plant"]["joints"] == ["shoulder"]
+
+
+def test_a_joint_without_inertia_has_a_guess_above_zero():
+    assert [unknown["guess"] for unknown in loop_of_servos([2.0, 0.0], 0.001).keys["kp"]] == [2000.0, 2.0]
+    assert loop_of_servos([0.0], 0.004).keys["kp"]["guess"] > 0
+
+
+@pytest.mark.parametrize(("period", "words"), [(0.002, "State 1 / rate"), (0.004, "else identify finds it")])
+def test_a_stated_rate_of_the_loop_is_not_searched_for(period, words):
+    loop = loop_of_servos([1.0], period)
+    assert ("period" in loop.keys) == (period < 0.003)
+    assert words in loop.questions[0]
 
 
 @pytest.mark.slow

@@ -52,9 +52,11 @@ NAMES = {
     "set_point_2": "wanted of 2",
     # readings of a body, which are those of no joint
     "gyro_x": "passed over",
-    "imu.angular_velocity.z": "passed over of angular z",
     "accelerometer_y": "passed over",
     "twist.angular.z": "velocity",
+    "twist [deg]": "of twist",
+    "joint_position_twist": "position of twist",
+    "imu_time": "time of imu",
     # derivatives, as students and robots' programs write them
     "theta_dot": "velocity",
     "thetaDot": "velocity",

@@ -121,7 +121,6 @@ def test_noise_that_shakes_a_loop_is_no_missing_physics():
         assert np.mean(seen) > 0.95
 
 
-@pytest.mark.slow
 def arm_at_truth(seed: int, *, gain: float = 1.0):
     """Return the session of an arm without a force at its true values, or with other gains of position."""
     drawn = arm(seed)
@@ -139,6 +138,7 @@ def arm_at_truth(seed: int, *, gain: float = 1.0):
     return open_session(case, drawn.columns())
 
 
+@pytest.mark.slow
 def test_an_arm_whose_loops_shake_it_is_complete_at_the_truth():
     """The excess of its second joint over white noise is 0.155 for a limit of 0.121."""
     session = arm_at_truth(40_018)
@@ -147,6 +147,7 @@ def test_an_arm_whose_loops_shake_it_is_complete_at_the_truth():
     assert [r.complete for r in found] == [True, True]
 
 
+@pytest.mark.slow
 def test_a_search_of_an_arm_that_leaves_more_than_noise_says_what_it_does_not_try():
     session = arm_at_truth(40_018, gain=0.8)
     machine, names = session.machine, session.machine.parameters.names

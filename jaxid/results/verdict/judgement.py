@@ -11,8 +11,10 @@ from jaxid.consistency.absent import known_forces
 from jaxid.consistency.clipped import SEEMS
 from jaxid.consistency.force_reading import ForceReading
 from jaxid.consistency.law import law_of_rows
+from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.force_timing import delay_words
+from jaxid.estimators.several.parts import parts_of
 from jaxid.gap import DRIFTED, Gap
 from jaxid.machine import Machine
 from jaxid.names import LEAVE_ROWS_OUT, SIMULATE_THE_LOOP
@@ -348,8 +350,8 @@ def _completeness_words(
     )
     lines += _loop_words(session)
     machine = session.machine
-    by_joint = machine.unforced(session.fit.log) and machine.plant.coupled
-    if search == "none" and not by_joint:
+    by_joint = stands_apart(machine, parts_of(session))
+    if search == "none" and (by_joint or not (machine.unforced(session.fit.log) and machine.plant.coupled)):
         lines.append(_SEARCH)
     if search in ("found", "unexplained") and by_joint:
         lines.append(_NO_SPRINGS)
