@@ -231,11 +231,11 @@ def _with_loop(
         log: The log.
         folder: Folder in which the case will stand.
     """
-    tried = _first_case(source, folder, [*sections, loop_of_servos([1.0] * joints, math.inf)])
+    tried = [*sections, loop_of_servos([1.0] * joints, math.inf)]
     try:
-        session = open_session(tried.case(), log)
+        session = open_session(_first_case(source, folder, tried).case(), log)
     except InputError:
-        return [*sections, loop_of_servos([1.0] * joints, math.inf)]  # the next command says what is wrong
+        return tried  # the next command says what is wrong
     inertias = mean_inertias(session.machine, session.fit.data)
     return [*sections, loop_of_servos(inertias.tolist(), session.fit.log.period)]
 

@@ -141,7 +141,7 @@ class Draft:
         """Refuse positions in a unit of which nothing says the size: the links of a file need angles."""
         unit = self._measures.labels.get("position")
         if unit is not None:
-            name = self._chosen.position[0].name
+            name = (self._chosen.position or self._chosen.velocity)[0].name
             raise InputError(
                 f"'{name}' is in {unit}, and the links of {robot.file} need rad or m",
                 where=self._raw.source,

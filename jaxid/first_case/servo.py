@@ -27,7 +27,7 @@ def loop_of_servos(inertias: Sequence[float], period: float) -> Section:
     """Return [controller] with the gains of a loop of 5 Hz about each inertia, and an unknown delay.
 
     Args:
-        inertias: What each servo moves [kg m^2 or kg]; the guess for one that moves nothing is small.
+        inertias: Inertia that each servo moves [kg m^2 or kg]; zero counts as a small part of the largest.
         period: Time between two rows of the log [s].
     """
     rate, least = 2 * np.pi * BANDWIDTH, _LEAST * max(inertias, default=0.0) or 1.0

@@ -70,7 +70,7 @@ def test_a_urdf_and_commands_make_a_case_of_unknown_loops(robot, tmp_path):
     tables = first.tables
     assert tables["plant"]["unknown"] == ["armature", "damping", "frictionloss"]
     assert tables["log"]["reference"] == {"shoulder": "cmd1", "elbow": "cmd2"}
-    # The fit finds the course of the command, and the counts go round the loop.
+    # The fit finds the course of the command, and the loop reads counts.
     assert "reference_hold" not in tables["log"]
     assert tables["sensor"]["position_resolution"] == pytest.approx(COUNT, rel=1e-4)
 
