@@ -15,8 +15,9 @@ from benchmarks.unforced_machines import COARSE, DECLARED, NOISE, RATES, command
 from truth.arm.servos import Links, Servo, run
 
 COUNTS = (4096, 16000)
-# Step of integration [s], and time before a log in which the arm sinks to where its servos hold it [s].
-STEP, SETTLING = 2e-5, 1.0
+# Step of integration [s], and time before a log in which the arm sinks to where its servos hold it [s]; an
+# elastic joint swings for longer.
+STEP, SETTLING, SWINGING = 2e-5, 1.0, 3.0
 # Values of a servo that the case does not know.
 OWN = ("rotor", "kp", "kd")
 HIDDEN = (
@@ -29,6 +30,8 @@ HIDDEN = (
     "unbalance",
     "load_friction",
 )
+# Effects that put a spring between a rotor with its encoder and its link.
+ELASTIC = ("joint_flexibility", "backlash")
 
 
 @dataclass(frozen=True)
@@ -74,13 +77,18 @@ class Arm:
             exact: Without the errors of the encoders, in the steps of the oracle.
         """
         ticks = np.repeat(self.command, self.every, axis=0)
-        held = np.tile(ticks[0], (round(SETTLING * self.rate), 1))
+        swings = any(kind in servo.effects for servo in self.servos for kind in ELASTIC)
+        held = np.tile(ticks[0], (round((SWINGING if swings else SETTLING) * self.rate), 1))
         options = {"rate": self.rate, "step": COARSE if exact else STEP}
-        start = run(self.links, self.servos, held, start=ticks[0], **options)["position"][-1]
+        settled = run(self.links, self.servos, held, start=ticks[0], **options)
+        options |= {"start": settled["position"][-1], "start_of_links": settled["links"][-1]}
         if exact:
-            return run(self.links, servos or self.servos, ticks, start=start, **options)
+            servos = servos or self.servos
+            rigid = [k for k, s in enumerate(servos) if not any(kind in s.effects for kind in ELASTIC)]
+            options["start_of_links"][rigid] = options["start"][rigid]
+            return run(self.links, servos, ticks, **options)
         noise = NOISE * np.random.default_rng([40, self.seed]).standard_normal(ticks.shape)
-        return run(self.links, self.servos, ticks, start=start, noise=noise, resolution=self.count, **options)
+        return run(self.links, self.servos, ticks, noise=noise, resolution=self.count, **options)
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return the log: time, encoders, commands."""
@@ -217,8 +225,10 @@ def arm(seed: int, hidden: str | None = None, joint: int = 0) -> Arm:
     )
     if hidden is None or hidden in DECLARED:
         return made
-    inertia = float(inertias[joint] + servos[joint].rotor)
-    values = _values(hidden, made, inertia, rng)
+    if hidden in ELASTIC:
+        values = _spring(hidden, made, float(inertias[joint]), rng)
+    else:
+        values = _values(hidden, made, float(inertias[joint] + servos[joint].rotor), rng)
     found = dataclasses.replace(servos[joint], effects={**servos[joint].effects, hidden: values})
     return dataclasses.replace(made, servos=tuple(found if k == joint else s for k, s in enumerate(servos)))
 
@@ -263,3 +273,14 @@ def _values(kind: str, made: Arm, inertia: float, rng: np.random.Generator) -> d
         "load_friction": {"coefficient": rng.uniform(0.1, 0.35)},
     }
     return {name: float(value) for name, value in draws[kind].items()}
+
+
+def _spring(kind: str, made: Arm, inertia: float, rng: np.random.Generator) -> dict[str, float]:
+    """Draw the values of a spring in front of a link of this inertia [kg m^2], or of play and its contact."""
+    if kind == "backlash":
+        turn = 2 * np.pi * min(40.0, made.rate / 10)
+        values = {"damping": 0.4 * inertia * turn, "gap": rng.uniform(0.01, 0.06)}
+    else:
+        turn = 2 * np.pi * rng.uniform(5.0, min(20.0, made.rate / made.every / 10))
+        values = {"damping": inertia * turn * rng.uniform(0.05, 0.2)}
+    return {"stiffness": float(inertia * turn**2)} | {name: float(v) for name, v in values.items()}

@@ -82,3 +82,40 @@ def test_an_effect_is_that_of_the_exact_axis(kind):
     )["position"][:, 0]
     assert np.abs(found - axis).max() < 1e-6
     assert np.abs(without - axis).max() > 1e-3
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.04])
+def test_an_elastic_joint_is_that_of_the_exact_chain(gap):
+    """At an arm whose second link weighs nothing beside the first, and without weight."""
+    from truth.axis.stepper import Loop, Sensor
+    from truth.chain.stepper import ChainMachine, simulate_chain
+
+    rotor, behind, stiffness, damping = 0.1, 0.3, 300.0, 2.0
+    links = Links(mass=(0.0, 1e-12), along=(0.0, 0.0), across=(0.0, 0.0), about=(behind, 1e-12), length=0.1)
+    frictions = {"viscous_friction": {"coefficient": 1.0}, "coulomb_friction": {"level": 0.5}}
+    spring = {"stiffness": stiffness, "damping": damping}
+    hidden = {"backlash": {**spring, "gap": gap}} if gap else {"joint_flexibility": spring}
+    asked = reference()
+    arm = [Servo(rotor, KP[0], KD[0], {**frictions, **hidden}), Servo(0.1, 4.0, 0.5)]
+    found = run(links, arm, asked, rate=RATE, step=1e-5, start=asked[0])["position"][:, 0]
+
+    effects: dict = {("coulomb_friction", 1): frictions["coulomb_friction"]}
+    effects |= {("backlash", 2): {"gap": gap}} if gap else {}
+    machine = ChainMachine(
+        (rotor, behind),
+        (1.0, 0.0),
+        (0.0, stiffness, 0.0),
+        effects=effects,
+        actuated=(1,),
+        coupling=(0.0, damping, 0.0),
+    )
+    loop = Loop(kind="pd", kp=KP[0], kd=KD[0], reference=asked[:, 0])
+    chain = simulate_chain(
+        machine, [loop], Sensor(), rate=RATE, duration=len(asked) / RATE, step=1e-5,
+        initial_position=asked[0, 0],
+    )["position"][:, 0]  # fmt: skip
+    rigid = run(
+        links, [Servo(rotor, KP[0], KD[0], frictions), arm[1]], asked, rate=RATE, step=1e-5, start=asked[0]
+    )["position"][:, 0]
+    assert np.abs(found - chain).max() < 1e-5
+    assert np.abs(found - rigid).max() > 1e-3
