@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxid.estimators.common.scoring import Scored
 from jaxid.estimators.innovations import Innovations, fit, fit_steps
@@ -53,6 +53,10 @@ class Member:
     def drives(self) -> int:
         """Number of commands."""
         return len(self.at.force)
+
+    def rests(self, noise: Float[np.ndarray, " q"]) -> Bool[np.ndarray, " q"]:
+        """Return the mask of the noises that rest at their present floor, from their logarithms."""
+        return noise <= self.problem.low + _AT_FLOOR
 
     def slopes(self, scored: Scored) -> Float[np.ndarray, "time k own"]:
         """Return the derivatives of the innovations, over their standard deviations, by the values in SI."""

@@ -310,6 +310,11 @@ def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estim
             f"the command was computed by the declared law from the logged readings{where}: the logged one "
             "is the same but for white noise of its reading"
         )
+    if any(np.any(m.rests(n)[: m.drives]) for m, n in zip(fit.members, end.noises, strict=True)):
+        notes.append(
+            "the noise of the force came to the lowest value that the filter takes: the standard deviations "
+            "are those at that noise, and larger than necessary if there is less"
+        )
     if min(min(entry["whiteness"]["p"]) for entry in entries) < REJECTS:
         notes.append(
             f"the innovations are not white{_bands(fit, rows)} (rounding, coloured noise or an incomplete "
