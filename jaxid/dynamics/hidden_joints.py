@@ -19,11 +19,12 @@ from jaxtyping import Float
 
 from jaxid.arrays import Array
 from jaxid.dynamics.dry_friction import set_valued_step
-from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, picked, small_solve, spread
+from jaxid.dynamics.rhs import State, acceleration, affine_flow, hold_polynomial, picked, spread
 from jaxid.model.balance import Balance
 from jaxid.model.plant import Plant
 from jaxid.model.smoothing import Smoothing
 from jaxid.numerics.affine import Affine
+from jaxid.numerics.elimination import small_solve
 from jaxid.numerics.kept import kept_jit
 
 Motion = tuple[Array, Array, Array]

@@ -22,6 +22,7 @@ from jaxid.errors import InputError
 from jaxid.model.balance import Balance
 from jaxid.model.plant import Plant
 from jaxid.numerics.affine import Affine, affine
+from jaxid.numerics.elimination import small_solve
 from jaxid.numerics.smooth import ramp, sign
 from jaxid.numerics.tangents import varying
 
@@ -38,28 +39,6 @@ class State(eqx.Module):
     q: Float[Array, " n"]
     qd: Float[Array, " n"]
     own: tuple
-
-
-def small_solve(a: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Solve a x = b by unrolled elimination, for the small mass matrices inside loops.
-
-    A LAPACK call inside a scan would defeat the loop flag (see `jaxid._platform`), 60 times slower.
-    No pivoting: a mass matrix is positive definite.
-    """
-    n = b.size
-    rows = [[a[i, j] for j in range(n)] + [b[i]] for i in range(n)]
-    # Reciprocals of the pivots: those of a constant mass matrix are taken out of the loop.
-    scale: list[Array] = []
-    for k in range(n):
-        scale.append(1.0 / rows[k][k])
-        for i in range(k + 1, n):
-            factor = rows[i][k] * scale[k]
-            rows[i] = [x - factor * y for x, y in zip(rows[i], rows[k], strict=True)]
-    x: list[Array] = [jnp.zeros(())] * n
-    for k in reversed(range(n)):
-        known = [rows[k][j] * x[j] for j in range(k + 1, n)]
-        x[k] = sum((-y for y in known), rows[k][n]) * scale[k]
-    return jnp.stack(x)
 
 
 @jax.custom_jvp

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxid.arrays import Array
 from jaxid.effects.registry import register
-from jaxid.model.effect import Action, Effect, Scales, Signals
+from jaxid.model.effect import Action, AddedSpring, Effect, Scales, Signals
 from jaxid.model.parameter import parameter
 from jaxid.numerics import smooth
 
@@ -55,7 +55,7 @@ class Backlash(Effect):
 
 
 @register("joint_flexibility")
-class JointFlexibility(Effect):
+class JointFlexibility(AddedSpring):
     """Part of the inertia, J, sits behind a spring: k e + d e' - (-J a) on the joint.
 
     e is the elongation of the spring: J (a + e'') = -k e - d e'. The inertia of the plant stays that of the
@@ -72,7 +72,6 @@ class JointFlexibility(Effect):
     without_force = True
 
     with_springs = False
-    adds_spring = True
 
     stiffness: Array = parameter("force/position", "positive", "of the spring")
     damping: Array = parameter("force*time/position", "positive", "beside the spring")
@@ -80,16 +79,31 @@ class JointFlexibility(Effect):
     gap: Array | None = parameter("position", "positive", "total clearance in series with it", optional=True)
 
     def act(self, x: Signals, state: Array) -> Action:
-        w = jnp.sqrt(jnp.divide(self.stiffness, self.load_inertia))
-        e, ed = state[0] / w, state[1]
+        _, ed, pull = self.spring(state)
+        if x.elongating is not None:  # the plant has what is behind the spring, and its pull
+            return Action(rate=jnp.stack([self._frequency * ed, x.elongating]))
+        rate = jnp.stack([self._frequency * ed, -x.ydd - pull / self.load_inertia])
+        return Action(force=self.load_inertia * x.ydd + pull, rate=rate)
+
+    @property
+    def _frequency(self) -> Array:
+        return jnp.sqrt(jnp.divide(self.stiffness, self.load_inertia))
+
+    def spring(self, state: Array) -> tuple[Array, Array, Array]:
+        e, ed = state[0] / self._frequency, state[1]
         pull = self.stiffness * e + self.damping * ed
         if self.gap is not None:
             half = 0.5 * self.gap
             width = _CORNER * half
             lost = self.stiffness * smooth.clip(e, half, width)
             pull = pull - lost - self.damping * smooth.within(e, half, width) * ed
-        rate = jnp.stack([w * ed, -x.ydd - pull / self.load_inertia])
-        return Action(force=self.load_inertia * x.ydd + pull, rate=rate)
+        return e, ed, pull
+
+    def pulling(self, pull: Array) -> Array:
+        e = pull / self.stiffness
+        if self.gap is not None:
+            e = e + 0.5 * self.gap * jnp.sign(pull)
+        return jnp.stack([self._frequency * e, jnp.zeros_like(e)])
 
     def initial_state(self, u: Array) -> Array:
         return jnp.zeros((2,), u.dtype)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -60,6 +60,7 @@ class PortSignals(eqx.Module):
     stiffness: Array
     damping: Array
     field: Array
+    elongating: Array | None = None
 
     @classmethod
     def of(cls, plant: Plant, q: Array, qd: Array, qdd: Array) -> PortSignals:
@@ -82,7 +83,20 @@ class PortSignals(eqx.Module):
             stiffness=self.stiffness[i],
             damping=self.damping[i],
             field=self.field,
+            elongating=None if self.elongating is None else self.elongating[i],
         )
+
+
+class BehindSprings(eqx.Module):
+    """What a plant does whose links, or a part of them, are behind springs that effects add to its joints.
+
+    Args:
+        inertial: Inertial forces and weight by coordinate, the pull of the springs included [N or N m].
+        elongating: Second derivative of the elongation of each spring, by port [m/s^2 or rad/s^2].
+    """
+
+    inertial: Array
+    elongating: Array
 
 
 class BarePlant(eqx.Module):
@@ -129,6 +143,10 @@ def balance(
         bare: The plant without effects at this motion, if it is known.
     """
     port = PortSignals.of(plant, q, qd, qdd) if bare is None else bare.port
+    # Along a known motion links count as in front of their springs, which is cheaper and near enough there.
+    behind = plant.behind_springs(q, qd, qdd, u, states) if bare is None else None
+    if behind is not None:
+        port = replace(port, elongating=behind.elongating)
     sums = _Sums.of(plant, port.y.size, u, t)
 
     for run in group_by_kind(plant.effects, sums.drives):
@@ -145,7 +163,10 @@ def balance(
     force = stacked(sums.force) + reaction
     react = _pull_back(plant, q, force) if bare is None else bare.pulled_back(force)
     drive = stacked(sums.drive)
-    inertial = plant.inertial(q, qd, qdd) if bare is None else bare.inertial
+    if behind is not None:
+        inertial = behind.inertial
+    else:
+        inertial = plant.inertial(q, qd, qdd) if bare is None else bare.inertial
     residual = inertial - react - plant.applied(drive, q.size)
     return Balance(
         residual=residual,

@@ -34,6 +34,8 @@ class Signals(eqx.Module):
         stiffness: Stiffness of the plant's spring whose elongation is the port [N/m or N m/rad]; else zero.
         damping: Damping of this spring [N s/m or N m s/rad]; else zero.
         field: Magnitude of the acceleration of gravity, whatever the direction of the port [m/s^2].
+        elongating: Second derivative of the elongation of an added spring, which a plant with links behind it
+            knows [m/s^2 or rad/s^2]; None: the effect computes it.
     """
 
     y: Array
@@ -48,6 +50,7 @@ class Signals(eqx.Module):
     stiffness: Array
     damping: Array
     field: Array | float = STANDARD_GRAVITY
+    elongating: Array | None = None
 
 
 class Action(eqx.Module):
@@ -277,6 +280,22 @@ class Effect(eqx.Module):
     def neutral(cls, scales: Scales) -> dict[str, float]:
         """Return values at which the effect is almost zero and its derivatives still exist."""
         return scaled(cls, cls.starts(scales)[0], 1e-9)
+
+
+class AddedSpring(Effect):
+    """An effect that puts a part J of the inertia, or of a plant's links, behind a spring."""
+
+    adds_spring = True
+
+    load_inertia: eqx.AbstractVar[Array]
+
+    def spring(self, state: Any) -> tuple[Array, Array, Array]:
+        """Return elongation, its rate, and the pull of the spring on the joint, from the internal state."""
+        raise NotImplementedError
+
+    def pulling(self, pull: Array) -> Any:
+        """Return the internal state at rest with a pull on the joint."""
+        raise NotImplementedError
 
 
 def carries_force(info: ParameterInfo) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.model.balance import Balance, balance, stacked
+from jaxid.model.balance import Balance, BehindSprings, balance, stacked
 from jaxid.model.effect import Effect
 from jaxid.model.interface import PlantInterface
 from jaxid.model.parameter import parameters_of
@@ -93,6 +93,33 @@ class Plant(PlantInterface):
         return tuple(
             e.initial_state(zero if j is None else u[j]) for e, j in zip(self.effects, drives, strict=True)
         )
+
+    def resting_states(self, q: Float[Array, " n"], u: Float[Array, " m"]) -> tuple:
+        """Return the internal states of the effects at rest at a position under a long constant `u`.
+
+        A plant whose links are behind springs that effects add overrides it: their weight stretches these.
+        """
+        return self.initial_states(u)
+
+    def behind_springs(
+        self,
+        q: Float[Array, " n"],
+        qd: Float[Array, " n"],
+        qdd: Float[Array, " n"],
+        u: Float[Array, " m"],
+        states: tuple,
+    ) -> BehindSprings | None:
+        """Return what the plant does with links behind springs of its effects; None: it has no such links.
+
+        Arguments are those of `balance`.
+        """
+        return None
+
+    def beyond_springs(
+        self, q: Float[Array, " n"], qd: Float[Array, " n"], states: tuple
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]] | None:
+        """Return position and velocity of the links; None: they are those of the joints."""
+        return None
 
     def balance(
         self,

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxid.arrays import Array
-from jaxid.model.effect import Effect
+from jaxid.model.balance import BehindSprings
+from jaxid.model.effect import AddedSpring, Effect
 from jaxid.model.links import WithLinks
 from jaxid.model.parameter import as_array, parameter
+from jaxid.numerics.elimination import small_solve
 from jaxid.plants.few_joints import MOST_JOINTS, FewJoints
 from jaxid.plants.geometry import Geometry
 from jaxid.plants.rigid_tree import Tree, inverse_dynamics, pseudo_inertia
 
 _FIRST = ("moment", "free")
 _SECOND = ("inertia", "free")
+# Evaluations of the weight by which a spring settles: it changes little over an elongation.
+_SETTLES = 3
 
 
 class LinkTree(WithLinks):
@@ -165,12 +172,83 @@ class LinkTree(WithLinks):
 
     def inertial(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Return the forces of the links, whose derivatives are analytical, and of the rotors."""
-        tau = self._links_force(q, qd, qdd) if self.polynomials is None else self.polynomials(q, qd, qdd)
+        return self._of_links_alone(q, qd, qdd) + self._of_rotors(qdd)
+
+    def _of_rotors(self, qdd: Array) -> Array | float:
         if self.rotor_inertia is None:
-            return tau
-        if self.gear_ratio is None:
-            return tau + self.rotor_inertia * qdd
-        return tau + self.rotor_inertia * self.gear_ratio**2 * qdd
+            return 0.0
+        return self.rotor_inertia * (qdd if self.gear_ratio is None else self.gear_ratio**2 * qdd)
+
+    def _of_links_alone(self, q: Array, qd: Array, qdd: Array) -> Array:
+        return self._links_force(q, qd, qdd) if self.polynomials is None else self.polynomials(q, qd, qdd)
+
+    def behind_springs(
+        self, q: Array, qd: Array, qdd: Array, u: Array, states: tuple
+    ) -> BehindSprings | None:
+        """Return the forces of the arm with links behind springs, each by its own.
+
+        An inertia J behind the spring of a joint stands for J / M of all that turns with the joint, M being
+        the inertia of that in the arm's zero position. With all of it behind, the rotor alone is in front.
+        """
+        springs = self._springs(states)
+        if not springs:
+            return None
+        joints = [joint for joint, _, _ in springs]
+        parts = [spring.load_inertia / self._inertia_at_zero(joint) for joint, spring, _ in springs]
+        at, units = self._beyond(q, qd, springs), jnp.asarray(np.eye(q.size)[joints])
+        pulls = [spring.spring(state)[2] for _, spring, state in springs]
+
+        force = functools.partial(self._of_links_alone, *at)
+        before, columns = force(qdd), jax.vmap(lambda unit: jax.jvp(force, (qdd,), (unit,))[1])(units)
+        own = jnp.stack([columns[:, joint] for joint in joints])
+        missing = [
+            -pull / part - before[joint] for joint, part, pull in zip(joints, parts, pulls, strict=True)
+        ]
+        edd = small_solve(own, jnp.stack(missing))
+        links = before + jnp.sum(columns * edd[:, None], axis=0)
+
+        # In front of a spring are the rotor, and links only as far as they are not behind it.
+        share = dict(zip(joints, parts, strict=True))
+        rows = [
+            (1.0 - share[k]) * before[k] + share[k] * links[k] if k in share else links[k]
+            for k in range(q.size)
+        ]
+        turning = dict(zip(joints, edd, strict=True))
+        elongating = [turning.get(k, jnp.zeros(())) for k in range(self.ports(q).size)]
+        return BehindSprings(jnp.stack(rows) + self._of_rotors(qdd), jnp.stack(elongating))
+
+    def beyond_springs(self, q: Array, qd: Array, states: tuple) -> tuple[Array, Array] | None:
+        springs = self._springs(states)
+        return self._beyond(q, qd, springs) if springs else None
+
+    def _beyond(
+        self, q: Array, qd: Array, springs: Sequence[tuple[int, AddedSpring, Array]]
+    ) -> tuple[Array, Array]:
+        for joint, spring, state in springs:
+            (e, ed, _), unit = spring.spring(state), np.eye(q.size)[joint]
+            q, qd = q + e * unit, qd + ed * unit
+        return q, qd
+
+    def resting_states(self, q: Array, u: Array) -> tuple:
+        states, still = list(self.initial_states(u)), jnp.zeros_like(q)
+        springs = {k: e for k, e in enumerate(self.effects) if isinstance(e, AddedSpring)}
+        for _ in range(_SETTLES if springs else 0):
+            at = self._beyond(q, still, [(e.port, e, states[k]) for k, e in springs.items()])[0]
+            weight = self._of_links_alone(at, still, still)
+            for k, e in springs.items():
+                states[k] = e.pulling(-e.load_inertia / self._inertia_at_zero(e.port) * weight[e.port])
+        return tuple(states)
+
+    def _springs(self, states: tuple) -> list[tuple[int, AddedSpring, Array]]:
+        """Return joint, effect and internal state of each spring that an effect adds."""
+        pairs = zip(self.effects, states, strict=True)
+        return [(e.port, e, z) for e, z in pairs if isinstance(e, AddedSpring)]
+
+    def _inertia_at_zero(self, joint: int) -> Array:
+        """Return the inertia of all that turns with a joint in the arm's zero position, without its rotor."""
+        still, unit = jnp.zeros(self.joints), jnp.asarray(np.eye(self.joints)[joint])
+        force = lambda a: self._of_links_alone(still, still, a)
+        return jax.jvp(force, (still,), (unit,))[1][joint]
 
     def prepared(self) -> Self:
         geometry, moments, polynomials = self.geometry.at_zero(), self._moments(), None

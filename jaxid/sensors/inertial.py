@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxid.arrays import Array
-from jaxid.dynamics.rhs import small_solve
 from jaxid.model.parameter import as_array
 from jaxid.model.plant import Plant
+from jaxid.numerics.elimination import small_solve
 
 # Weight of the held value relative to the readings: it matters only if these do not determine a motion.
 _HELD = 1e-9

@@ -92,7 +92,7 @@ class KalmanFilter(eqx.Module):
         before, after = interval_forces(plant, drive, self.command)
         held = stays_held(plant, drive)
 
-        x0 = State(self.start[:n], self.start[n:], plant.initial_states(before[0]))
+        x0 = State(self.start[:n], self.start[n:], plant.resting_states(self.start[:n], before[0]))
         x, unravel = ravel_pytree(x0)
         size, m = x.size, before.shape[1]
         moving, speeds = np.arange(2 * n), n + np.arange(n)

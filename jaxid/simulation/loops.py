@@ -45,6 +45,7 @@ class Trajectory(eqx.Module):
         command: Logged command, (time, m), before the declared gain.
         reading: Position as the sensor reports it, (time, n).
         found: Estimates of a law that identifies, see `Controller.learned`; None for other laws.
+        links: Position and velocity of links behind springs, (time, n) each; None: they are the joints'.
     """
 
     position: Float[Array, "time n"]
@@ -52,6 +53,7 @@ class Trajectory(eqx.Module):
     command: Float[Array, "time m"]
     reading: Float[Array, "time n"]
     found: Any = None
+    links: tuple[Array, Array] | None = None
 
 
 class Drive(eqx.Module):
@@ -173,7 +175,7 @@ def open_loop(
     known = command if past is None else jnp.concatenate([past, command])
     before, after = (f[earlier:] for f in interval_forces(plant, drive, known))
     times = start + drive.period * jnp.arange(command.shape[0])
-    x0 = State(position, velocity, plant.initial_states(before[0]) if own is None else own)
+    x0 = State(position, velocity, plant.resting_states(position, before[0]) if own is None else own)
     held = stays_held(plant, drive)
     advance = drive.stepper(plant, x0, (before[0],) if held else (before[0], after[0]))
     n = command.shape[0]
@@ -257,8 +259,8 @@ def closed_loop(
     tick0 = Tick(sensor.read(position), first, driven, velocity=own)
     held = drive.gain * controller.command(tick0, memory, disturbance[0])[0]
     past = jnp.broadcast_to(held, (drive.longest_delay + 1, held.size))
-    x0 = State(position, velocity, plant.initial_states(held))
     on_plant = held if load is None else jnp.concatenate([held, load[0]])
+    x0 = State(position, velocity, plant.resting_states(position, on_plant))
     advance = drive.stepper(plant, x0, (on_plant,) * (1 if drive.longest_delay == 0 else 2))
 
     inertial, m = sensor.inertial, drive.gain.size
@@ -292,7 +294,9 @@ def closed_loop(
         if last is not None:
             assert noise is not None, "a command is measured only with noise"
             last = sensor.read_command(u, noise[n : n + m])
-        return (new, memory, past, last, held, moved), (x.q, x.qd, u, reading, controller.learned(memory))
+        links = plant.beyond_springs(x.q, x.qd, x.own)
+        shown = (x.q, x.qd, u, reading, controller.learned(memory), links)
+        return (new, memory, past, last, held, moved), shown
 
     fresh = None if sensor.hold == 1 else jnp.arange(len(times)) % sensor.hold == 0
     measures = noise is not None and noise.shape[1] > n and sensor.force_noise is not None
@@ -300,8 +304,8 @@ def closed_loop(
     moved = None if inertial is None else (velocity, velocity, jnp.zeros_like(velocity))
     renews = None if inertial is None else jnp.arange(len(times)) % inertial.hold == 0
     inputs = (path, disturbance, noise, times, fresh, renews, load)
-    _, (q, v, u, reading, found) = jax.lax.scan(tick, (x0, memory, past, last, held, moved), inputs)
-    return Trajectory(q, v, u, reading, found)
+    _, shown = jax.lax.scan(tick, (x0, memory, past, last, held, moved), inputs)
+    return Trajectory(*shown)
 
 
 def _delayed_force(plant: Plant, drive: Drive, u: Array, past: Array) -> tuple[tuple[Array, ...], Array]:

@@ -32,8 +32,6 @@ from jaxid.sensors.encoder import Sensor
 
 # Unknown inertias of the rotors among the parameters of a tree.
 ROTOR = "rotor_inertia"
-# Most rows at which a joint's own inertia is evaluated for its mean.
-_ROWS = 200
 
 
 @dataclass(frozen=True)
@@ -46,6 +44,7 @@ class JointAlone:
         parts: The logs with their machines and loads.
         index: Number of each of its unknowns among those of the arm, (own,).
         links: Mean inertia of the links about the joint [kg m^2 or kg], a part of its machine's.
+        at_zero: That in the arm's zero position.
         ratio: Inertia at the joint for one of its rotor, the square of its gear.
         others: Logs that are not fitted.
     """
@@ -55,6 +54,7 @@ class JointAlone:
     parts: tuple[Part, ...]
     index: np.ndarray
     links: float
+    at_zero: float
     ratio: float
     others: tuple[Part, ...] = ()
 
@@ -148,6 +148,7 @@ def joints_alone(machine: Machine, parts: Sequence[Part], others: Sequence[Part]
         loads.append(np.asarray(force))
         inertias.append(np.asarray(own))
     means = np.mean(np.concatenate(inertias[: len(parts)]), axis=0)
+    at_zero = inertias_at_zero(machine)
     names = machine.parameters.names
     out = []
     for joint in range(machine.plant.joints):
@@ -157,18 +158,41 @@ def joints_alone(machine: Machine, parts: Sequence[Part], others: Sequence[Part]
         if not own:
             continue
         alone = []
-        for part, load in zip((*parts, *others), loads, strict=True):
-            # The force of the links beyond that of the constant inertia of the axis.
-            beside = means[joint] * part.data.qdd[:, joint] - load[:, joint]
-            one = _machine(part.machine, joint, means[joint], beside)
+        for part, force, own_inertia in zip((*parts, *others), loads, inertias, strict=True):
+            of_joint = (part.data.qdd[:, joint], force[:, joint], own_inertia[:, joint])
+            load = load_of(*of_joint, mean=means[joint], at_zero=at_zero[joint])
+            one = _machine(part.machine, joint, means[joint], load)
             index = np.array([own.index(name) for name in one.parameters.names], dtype=int)
             alone.append(Part(part.name, _log(part, joint), one, index, _prepared(part.data, joint)))
-        whole = _machine(machine, joint, means[joint], _column(alone[0].machine))
+        assert alone[0].machine.load is not None, "a joint alone has one"
+        whole = _machine(machine, joint, means[joint], alone[0].machine.load)
         index = np.array([names.index(name) for name in own])
         ratio = float(gear_squares(machine.plant)[joint])
         fitted, beside = tuple(alone[: len(parts)]), tuple(alone[len(parts) :])
-        out.append(JointAlone(joint, whole, fitted, index, float(means[joint]), ratio, beside))
+        inertias_of_links = (float(means[joint]), float(at_zero[joint]))
+        out.append(JointAlone(joint, whole, fitted, index, *inertias_of_links, ratio, beside))
     return out
+
+
+def load_of(
+    acceleration: Float[np.ndarray, " time"],
+    force: Float[np.ndarray, " time"],
+    inertia: Float[np.ndarray, " time"],
+    *,
+    mean: float,
+    at_zero: float,
+) -> Float[np.ndarray, "time 3"]:
+    """Return the load of a joint alone, as `LoadedAxis` takes it.
+
+    Args:
+        acceleration: Acceleration of the joint [rad/s^2 or m/s^2].
+        force: Force of the links on it [N m or N].
+        inertia: Inertia of the links about it [kg m^2 or kg].
+        mean: Mean of this inertia, which the axis has.
+        at_zero: The inertia in the arm's zero position.
+    """
+    rest = (force - inertia * acceleration) / at_zero
+    return np.stack([mean * acceleration - force, inertia / at_zero, rest], axis=1)
 
 
 def _moves(part: Part) -> bool:
@@ -202,6 +226,12 @@ def mean_inertias(machine: Machine, data: Prepared) -> Float[np.ndarray, " n"]:
     return np.mean(np.asarray(links), axis=0) + rotors
 
 
+def inertias_at_zero(machine: Machine) -> Float[np.ndarray, " n"]:
+    """Return the inertia of the links about each joint in an arm's zero position, (n,)."""
+    still = jnp.zeros((1, machine.plant.joints))
+    return np.asarray(of_links(links_of(machine), still, still, still)[1])[0]
+
+
 def gear_squares(plant: Any) -> np.ndarray:
     """Return the square of each joint's gear ratio."""
     return np.ones(plant.joints) if plant.gear_ratio is None else np.asarray(plant.gear_ratio) ** 2
@@ -209,17 +239,16 @@ def gear_squares(plant: Any) -> np.ndarray:
 
 @kept_jit
 def of_links(plant: LinkTree, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
-    """Return the forces of the links along a motion, (time, n), and inertias of joints at some rows."""
-    every = max(1, len(q) // _ROWS)
+    """Return the forces of the links along a motion, and their inertia about each joint, (time, n) each."""
     zero = jnp.zeros(q.shape[1])
 
     def own(q: Array) -> Array:
         return jnp.diagonal(jax.jacfwd(lambda a: plant.inertial(q, zero, a))(zero))
 
-    return jax.vmap(plant.inertial)(q, qd, qdd), jax.lax.map(own, q[::every])
+    return jax.vmap(plant.inertial)(q, qd, qdd), jax.lax.map(own, q)
 
 
-def _machine(machine: Machine, joint: int, links: float, load: Float[np.ndarray, " time"]) -> Machine:
+def _machine(machine: Machine, joint: int, links: float, load: Float[np.ndarray, "time 3"]) -> Machine:
     """Return the machine of a joint, with its unknowns, whose links have a constant inertia."""
     plant, law = machine.plant, machine.controller
     assert isinstance(plant, LinkTree), "checked by stands_apart"
@@ -241,14 +270,8 @@ def _machine(machine: Machine, joint: int, links: float, load: Float[np.ndarray,
         units=replace(machine.units, motion=plant.motion(joint) or machine.units.motion),
         controller=_law(law, drive, len(machine.gain)),
         sensor=_sensor(machine.sensor, joint, plant.joints),
-        load=np.reshape(load, (-1, 1)),
+        load=load,
     )
-
-
-def _column(machine: Machine) -> Float[np.ndarray, " time"]:
-    """Return the load of a joint alone."""
-    assert machine.load is not None, "a joint alone has one"
-    return machine.load[:, 0]
 
 
 def own_place(

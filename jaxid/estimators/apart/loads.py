@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.estimators.apart.joint import JointAlone, links_of, of_links
+from jaxid.estimators.apart.joint import JointAlone, links_of, load_of, of_links
 from jaxid.estimators.several.parts import Part
 from jaxid.logs.prepare import motion
 from jaxid.machine import Machine
@@ -47,7 +47,7 @@ def with_simulated_loads(
         found = motions[part.name]
         if found is None:
             return part
-        load = found.load(alone.joint, alone.links)
+        load = found.load(alone.joint, alone.links, alone.at_zero)
         return replace(part, machine=replace(part.machine, held_load=load))
 
     return [
@@ -61,20 +61,31 @@ def with_simulated_loads(
 
 
 class _Motions:
-    """Acceleration and force of the links along the motions of a log.
+    """Acceleration of the joints, and force and inertia of the links, along the motions of a log.
 
     Args:
-        inside: Mean acceleration over every tick of the simulation, and the links' force, (ticks, n) each.
+        inside: Mean acceleration of the links over every tick of the simulation, and their force, (ticks, n)
+            each.
         beside: What the measured motion has more of both, by row and joint; the same at every tick.
+        inertia: Inertia of the links about each joint, (ticks, n).
+        ahead: Acceleration of the joints less that of the links, which springs may drive apart, (ticks, n).
     """
 
-    def __init__(self, inside: tuple[np.ndarray, np.ndarray], beside: tuple[np.ndarray, np.ndarray]) -> None:
-        self.acceleration = inside[0] + beside[0]
-        self.force = inside[1] + beside[1]
+    def __init__(
+        self,
+        inside: tuple[np.ndarray, np.ndarray],
+        beside: tuple[np.ndarray, np.ndarray],
+        inertia: np.ndarray,
+        ahead: np.ndarray,
+    ) -> None:
+        self.inertia, self.acceleration = inertia, inside[0] + beside[0] + ahead
+        # That which links at the acceleration of their joint would take.
+        self.force = inside[1] + beside[1] + inertia * ahead
 
-    def load(self, joint: int, links: float) -> Float[np.ndarray, "ticks 1"]:
-        """Return the force on a joint beside that of a constant inertia of its links."""
-        return (links * self.acceleration - self.force)[:, joint : joint + 1]
+    def load(self, joint: int, links: float, at_zero: float) -> Float[np.ndarray, "ticks 3"]:
+        """Return the load of a joint alone; see `load_of`."""
+        acceleration, force, inertia = (x[:, joint] for x in (self.acceleration, self.force, self.inertia))
+        return load_of(acceleration, force, inertia, mean=links, at_zero=at_zero)
 
     @classmethod
     def of(cls, machine: Machine, part: Part) -> _Motions | None:
@@ -87,9 +98,10 @@ class _Motions:
         if not np.all(np.isfinite(q)) or not np.all(np.isfinite(v)):
             return None
         links = links_of(machine)
-        middle, speed = (np.concatenate([0.5 * (x[1:] + x[:-1]), x[-1:]]) for x in (q, v))
-        a = np.diff(v, axis=0, append=v[-1:]) / law.period
-        inside = a, np.asarray(of_links(links, middle, speed, a)[0])
+        apart = (q, v) if run.links is None else tuple(np.asarray(x) for x in run.links)
+        middle, speed = (np.concatenate([0.5 * (x[1:] + x[:-1]), x[-1:]]) for x in apart)
+        of_joints, a = (np.diff(x, axis=0, append=x[-1:]) / law.period for x in (v, apart[1]))
+        force, inertia = (np.asarray(x) for x in of_links(links, middle, speed, a))
 
         recipe, rows = part.data.recipe, q[:: replay.every]
         seen = motion(
@@ -105,7 +117,7 @@ class _Motions:
         more = measured[2] - seen[2], np.asarray(of_links(links, *measured)[0] - of_links(links, *seen)[0])
         times = log.time[0] + law.period * (np.arange(len(q)) + 0.5)
         at_ticks = (reference_at(log.time, x, times, "linear") for x in more)
-        return cls(inside, (next(at_ticks), next(at_ticks)))
+        return cls((a, force), (next(at_ticks), next(at_ticks)), inertia, of_joints - a)
 
 
 @kept_jit
