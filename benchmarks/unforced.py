@@ -1,11 +1,12 @@
 """Logs of servos and of arms without a force, by the exact stepper: what `identify` and `discover` find.
 
     python -m benchmarks.unforced [--coverage N] [--hidden N] [--nulls N] [--arm-hidden N] [--arm-nulls N]
-                                  [--arm-coverage N] [--first N] [--seconds S] [-o DIR]
+                                  [--arm-coverage N] [--arm-elastic N] [--first N] [--seconds S] [-o DIR]
 
 Coverage: the share of 95 % intervals that hold the truth, from guesses up to three times off, and for arms
 two to five times off. Hidden: one effect that the case does not declare,
-with what an oracle sees of it; on an arm of two joints it acts at one of them. Nulls: complete cases, in
+with what an oracle sees of it; on an arm of two joints it acts at one of them, and --arm-elastic draws those
+that have a spring at one. Nulls: complete cases, in
 which nothing should be named. The runs of a part have the numbers from --first (0) to below N. They are
 written to DIR/unforced.jsonl as they end; a second call goes on from there, and rewrites DIR/unforced.md from
 all of them. --seconds ends a call after so much time.
@@ -32,8 +33,9 @@ from benchmarks.unforced_table import table
 HERE = Path(__file__).parent / "results"
 # First seeds of the parts: no machine is in two of them.
 FIRST = {"coverage": 0, "hidden": 10_000, "nulls": 20_000, "arm_hidden": 30_000, "arm_nulls": 40_000}
-FIRST |= {"arm_coverage": 50_000}
+FIRST |= {"arm_coverage": 50_000, "arm_elastic": 60_000}
 RUNS = {"coverage": 40, "hidden": 40, "nulls": 40, "arm_hidden": 16, "arm_nulls": 8, "arm_coverage": 12}
+RUNS |= {"arm_elastic": 4}
 
 
 def of(part: str, number: int) -> Servo | Arm:
@@ -43,7 +45,10 @@ def of(part: str, number: int) -> Servo | Arm:
         kinds = unforced_arms.HIDDEN
         # The second joint in every other run, and in the next round of kinds the other one.
         hidden, joint = kinds[number % len(kinds)], (number + number // len(kinds)) % 2
-        drawn = arm(seed, hidden, joint) if part == "arm_hidden" else arm(seed)
+        if part == "arm_elastic":
+            drawn = arm(seed, "joint_flexibility", number % 2)
+        else:
+            drawn = arm(seed, hidden, joint) if part == "arm_hidden" else arm(seed)
         return replace(drawn, far=part == "arm_coverage")
     kinds = unforced_machines.HIDDEN
     return servo(seed, kinds[number % len(kinds)] if part == "hidden" else None)

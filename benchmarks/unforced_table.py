@@ -48,9 +48,9 @@ def table(records: list[Record]) -> str:
         "One effect at one joint; named means that it alone is named, at that joint. All gains, rotors, "
         "frictions and delays are unknown; the links are known.",
         "",
-        *_hidden(of("arm_hidden"), unforced_arms.HIDDEN),
+        *_hidden([*of("arm_hidden"), *of("arm_elastic")], (*unforced_arms.HIDDEN, "joint_flexibility")),
         *_nulls(of("arm_nulls")),
-        *_pace([*of("arm_hidden"), *of("arm_nulls")]),
+        *_pace([*of("arm_hidden"), *of("arm_elastic"), *of("arm_nulls")]),
         "",
         *[f"- failed: {r['part']} {r['number']}: {r['failed']}" for r in records if "failed" in r],
     ]

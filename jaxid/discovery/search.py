@@ -159,6 +159,10 @@ class Search:
         """Return a screen with what candidates gain far from the model; here they stay near it."""
         return screened
 
+    def ends_with(self, best: Sequence[Score]) -> bool:
+        """Check whether the search ends once these effects are in the model, whatever else is missing."""
+        return False
+
     def finer(self, model: Model) -> bool:
         """Give the candidates their finer starts, and return whether that may explain what a model leaves."""
         if self.acceptance.at_floor(model.theta):
@@ -246,6 +250,8 @@ class Search:
             steps.extend(dropped)
 
             now = frozenset(id(c) for c in model.added)
+            if self.ends_with(best):
+                return model, steps
             if now in tried:  # effects are added and dropped in turn
                 return model, steps
             tried.add(now)

@@ -60,7 +60,7 @@ class PortSignals(eqx.Module):
     stiffness: Array
     damping: Array
     field: Array
-    elongating: Array | None = None
+    elongating: tuple[Array | None, ...] | None = None
 
     @classmethod
     def of(cls, plant: Plant, q: Array, qd: Array, qdd: Array) -> PortSignals:
@@ -92,11 +92,12 @@ class BehindSprings(eqx.Module):
 
     Args:
         inertial: Inertial forces and weight by coordinate, the pull of the springs included [N or N m].
-        elongating: Second derivative of the elongation of each spring, by port [m/s^2 or rad/s^2].
+        elongating: Second derivative of the elongation of the spring of each port [m/s^2, rad/s^2]; None: it
+            has none, or its effect computes it.
     """
 
     inertial: Array
-    elongating: Array
+    elongating: tuple[Array | None, ...]
 
 
 class BarePlant(eqx.Module):

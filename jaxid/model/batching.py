@@ -57,8 +57,9 @@ def act_batched(effects: list[Effect], signals: list[Signals], states: list) -> 
         signals: Signals of each effect.
         states: Internal state of each effect; None if the kind has none.
     """
-    if len(effects) == 1:
-        return [effects[0].act(signals[0], states[0])]
+    # A plant may know more of some ports than of others.
+    if len({jax.tree.structure(x) for x in signals}) > 1 or len(effects) == 1:
+        return [effect.act(x, state) for effect, x, state in zip(effects, signals, states, strict=True)]
     treedef = jax.tree.structure(effects[0])
     omitted: list[Any] = []
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import ClassVar, Self, TypeGuard
 
 import equinox as eqx
 import jax
@@ -189,6 +189,7 @@ class LinkTree(WithLinks):
 
         An inertia J behind the spring of a joint stands for J / M of all that turns with the joint, M being
         the inertia of that in the arm's zero position. With all of it behind, the rotor alone is in front.
+        The spring of a shaft has a constant inertia behind it.
         """
         springs = self._springs(states)
         if not springs:
@@ -214,8 +215,8 @@ class LinkTree(WithLinks):
             for k in range(q.size)
         ]
         turning = dict(zip(joints, edd, strict=True))
-        elongating = [turning.get(k, jnp.zeros(())) for k in range(self.ports(q).size)]
-        return BehindSprings(jnp.stack(rows) + self._of_rotors(qdd), jnp.stack(elongating))
+        elongating = [turning.get(k) for k in range(self.ports(q).size)]
+        return BehindSprings(jnp.stack(rows) + self._of_rotors(qdd), tuple(elongating))
 
     def beyond_springs(self, q: Array, qd: Array, states: tuple) -> tuple[Array, Array] | None:
         springs = self._springs(states)
@@ -231,7 +232,7 @@ class LinkTree(WithLinks):
 
     def resting_states(self, q: Array, u: Array) -> tuple:
         states, still = list(self.initial_states(u)), jnp.zeros_like(q)
-        springs = {k: e for k, e in enumerate(self.effects) if isinstance(e, AddedSpring)}
+        springs = {k: e for k, e in enumerate(self.effects) if self._stretches(e)}
         for _ in range(_SETTLES if springs else 0):
             at = self._beyond(q, still, [(e.port, e, states[k]) for k, e in springs.items()])[0]
             weight = self._of_links_alone(at, still, still)
@@ -240,9 +241,12 @@ class LinkTree(WithLinks):
         return tuple(states)
 
     def _springs(self, states: tuple) -> list[tuple[int, AddedSpring, Array]]:
-        """Return joint, effect and internal state of each spring that an effect adds."""
+        """Return joint, effect and internal state of each spring that an effect adds to a joint."""
         pairs = zip(self.effects, states, strict=True)
-        return [(e.port, e, z) for e, z in pairs if isinstance(e, AddedSpring)]
+        return [(e.port, e, z) for e, z in pairs if self._stretches(e)]
+
+    def _stretches(self, effect: Effect) -> TypeGuard[AddedSpring]:
+        return isinstance(effect, AddedSpring) and effect.port < self.joints
 
     def _inertia_at_zero(self, joint: int) -> Array:
         """Return the inertia of all that turns with a joint in the arm's zero position, without its rotor."""

@@ -28,15 +28,15 @@ class LoadedAxis(Axis):
     def behind_springs(
         self, q: Array, qd: Array, qdd: Array, u: Array, states: tuple
     ) -> BehindSprings | None:
-        whole, elongating = self.inertial(q, qd, qdd), jnp.zeros_like(q)
+        whole, elongating = self.inertial(q, qd, qdd), jnp.zeros(())
         own, rest = _links(u)
         springs = [(e, z) for e, z in zip(self.effects, states, strict=True) if isinstance(e, AddedSpring)]
         for spring, state in springs:
             _, _, pull = spring.spring(state)
-            links = own * qdd + rest
+            links = own * qdd[0] + rest
             elongating = elongating - (links + pull / spring.load_inertia) / own
             whole = whole - spring.load_inertia * links - pull
-        return BehindSprings(whole, elongating) if springs else None
+        return BehindSprings(whole, (elongating,)) if springs else None
 
     def resting_states(self, q: Array, u: Array) -> tuple:
         rest = _links(u)[1]

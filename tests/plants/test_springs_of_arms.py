@@ -136,3 +136,24 @@ def test_a_joint_alone_moves_as_in_the_whole_arm(joint):
     found = make_replay(other, part.log, numerics)(other.plant)
     off = np.asarray(found.position)[:, 0] - np.asarray(whole.position)[:, joint]
     assert np.sqrt(np.mean(off**2)) > 1e-3
+
+
+def test_the_spring_of_a_shaft_has_a_constant_inertia_behind_it():
+    """Beside that of a joint, which has links behind it."""
+    motion, asked = exact({})
+    plant = opened({1: SPRINGS[1]}, motion, asked).machine.plant
+    spring = plant.effects[-1]
+    plant = replace(plant, shafts=((1.0, 2.0),), effects=(spring, replace(spring, port=2)))
+    rng = np.random.default_rng(0)
+    q, qd, qdd = rng.normal(size=(3, 2))
+    states, zero = tuple(0.1 * rng.normal(size=(2, 2))), np.zeros(())
+    both = plant.balance(q, qd, qdd, np.zeros(2), zero, states)
+    one = replace(plant, effects=plant.effects[:1]).balance(q, qd, qdd, np.zeros(2), zero, states[:1])
+
+    [e, ed], speed = states[1], np.sqrt(spring.stiffness / spring.load_inertia)
+    pull = spring.stiffness * e / speed + spring.damping * ed
+    ydd = qdd[0] + 2 * qdd[1]
+    force = spring.load_inertia * ydd + pull
+    assert np.allclose(both.residual, one.residual - force * np.array([1.0, 2.0]))
+    assert np.allclose(both.rates[1], [speed * ed, -ydd - pull / spring.load_inertia])
+    assert np.allclose(both.rates[0], one.rates[0])

@@ -160,13 +160,15 @@ class ArmSearch:
         return replace(self, every=list(every.values()), declared=declared), out, gained
 
     def waiting(self, found: Mapping[int, Discovery], searches: Mapping[int, int]) -> list[int]:
-        """Return the joints to search: those that were not, and then those whose loads were others.
+        """Return the joints to search: those that were not, not to the end, and then under other loads.
 
         Args:
             found: Search of each joint that was searched.
             searches: How often each joint was searched.
         """
         new = [joint for joint in self.by_excess if joint not in found]
+        # The first search of a joint ends with a spring, since links behind it load all joints otherwise.
+        new = new or [joint for joint in self.by_excess if searches[joint] == 1 and _has_spring(found[joint])]
         again = [joint for joint in self.by_excess if searches[joint] < _SEARCHES]
         if new or not again:
             return new
@@ -191,18 +193,27 @@ class ArmSearch:
         machine, theta = self.start_of_whole(found)
         return with_simulated_loads(joints, theta, [part_of(run, machine) for run in self.session.runs])
 
-    def searched(self, joint: int, *, max_effects: int, progress: Callable[[str], None]) -> Discovery:
+    def searched(
+        self, joint: int, *, max_effects: int, progress: Callable[[str], None], to_spring: bool
+    ) -> Discovery:
         """Search one joint alone, from the fit of the declared model.
 
         Args:
             joint: Its number, from 0.
             max_effects, progress: See `jaxid.discovery.in_loop.by_joint.explore_by_joint`.
+            to_spring: See `explored_from`.
         """
         alone, before = self._alone(joint), self.declared[joint]
         own = session_of_joint(self.session, alone.with_estimate(before.theta))
         # The arm as a whole is judged at the end.
         return explored_from(
-            own, before, max_effects=max_effects, progress=progress, effort=FEW, judged=False
+            own,
+            before,
+            max_effects=max_effects,
+            progress=progress,
+            effort=FEW,
+            judged=False,
+            to_spring=to_spring,
         )
 
     def without(self, found: Mapping[int, Discovery], joint: int, effect: int) -> dict[int, Discovery]:
@@ -373,6 +384,11 @@ def _with_effects(
 def _adds_one_of(r: Round, added: Sequence[Candidate]) -> bool:
     """Check that a step of a search added one of some candidates."""
     return r.step.added is not None and any(r.step.added.candidate is c for c in added)
+
+
+def _has_spring(d: Discovery) -> bool:
+    """Check that a search added a spring."""
+    return any(effect.adds_spring for effect in _added(d))
 
 
 def _added(d: Discovery) -> Sequence[Effect]:

@@ -71,7 +71,8 @@ def _searched(session: Session, max_effects: int, progress: Callable[[str], None
         if before:
             arm = arm.reopened(joint, found)
         searches[joint] += 1
-        found[joint] = arm.searched(joint, max_effects=max_effects, progress=at_joint)
+        first = searches[joint] == 1
+        found[joint] = arm.searched(joint, max_effects=max_effects, progress=at_joint, to_spring=first)
         if found[joint].kinds != ([] if before is None else before.kinds):
             at_joint("simulating the arm with what was found")
             arm, found = arm.settled(found)

@@ -369,6 +369,7 @@ class LoopSearch(Search):
         afar: Starts far from where an incomplete model ends; None: there are none.
         by_mean_readings: Function of a model that returns all unknowns of the superset as a fit of its mean
             readings gives them; None if there is no such fit.
+        to_spring: Whether the search ends with the first effect that adds a spring.
     """
 
     positions: PositionDomain | None = None
@@ -376,6 +377,7 @@ class LoopSearch(Search):
     coarse: Callable[[Model], list[np.ndarray]] = lambda model: []
     afar: Afar | None = None
     by_mean_readings: Callable[[Model], np.ndarray | None] = lambda model: None
+    to_spring: bool = False
     _fits: dict[frozenset[int], np.ndarray] = field(default_factory=dict)
     _searched: set[frozenset[int]] = field(default_factory=set)
     _drawn: dict[tuple[bytes, int], np.ndarray | None] = field(default_factory=dict)
@@ -462,6 +464,18 @@ class LoopSearch(Search):
         counts = self.samples.moving
         answered = float(np.sum(np.where(counts, np.mean(np.square(drawn), axis=0), 0.0)))
         return max(self.acceptance.noise, answered)
+
+    def ends_with(self, best: Sequence[Score]) -> bool:
+        """Check for an effect that adds a spring, in a search up to there."""
+        return self._adds_spring([s.candidate for s in best])
+
+    @property
+    def ended_early(self) -> bool:
+        """True if the search ended with a spring, so that what else is missing is not known."""
+        return self._adds_spring(self.model.added)
+
+    def _adds_spring(self, added: Sequence[cand.Candidate]) -> bool:
+        return self.to_spring and any(cand.effect_of(self.superset, c).adds_spring for c in added)
 
     def finer(self, model: Model) -> bool:
         """Return False: each start is a simulation here."""

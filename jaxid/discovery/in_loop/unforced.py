@@ -164,6 +164,7 @@ def explored_from(
     judged: bool = True,
     refit: Refit | None = None,
     among: frozenset[str] | None = None,
+    to_spring: bool = False,
 ) -> Discovery:
     """Search logs without a force from a fit of the declared model.
 
@@ -176,14 +177,16 @@ def explored_from(
             that nothing is missing.
         refit: Refit of a machine with what was found; None: `refitted`.
         among: Kinds of the effects that are tried; None: those of the case.
+        to_spring: Whether the search ends with the first effect that adds a spring, without rivals.
 
     Raises:
         InputError: If the loop cannot be simulated.
     """
     fitted, base = at_scale(before)
     search = _search(session, fitted, effort, progress, among)
+    search.to_spring = to_spring
     steps = search.run(max_effects)
-    alternatives = search.alternatives(steps)
+    alternatives = {} if search.ended_early else search.alternatives(steps)
     final, effects = final_machine(fitted, search, alternatives, steps)
     progress("refitting in simulation")
     after = (refit or refitted)(session, final, base) if effects else before

@@ -42,12 +42,6 @@ _SLIGHT = 0.05
 _MOST = 6
 _SEARCH = "The command jaxid discover searches for what is missing."
 
-# Of an arm without a force, which is searched joint by joint.
-_NO_SPRINGS = (
-    "A drive that is elastic or has clearance is not searched for at a joint of an arm without a force: "
-    "other effects may be named in its place, as an unbalance or a constant force."
-)
-
 
 @dataclass(frozen=True)
 class Judgement:
@@ -350,11 +344,9 @@ def _completeness_words(
     )
     lines += _loop_words(session)
     machine = session.machine
-    by_joint = stands_apart(machine, parts_of(session))
-    if search == "none" and (by_joint or not (machine.unforced(session.fit.log) and machine.plant.coupled)):
+    searched = not (machine.unforced(session.fit.log) and machine.plant.coupled)
+    if search == "none" and (searched or stands_apart(machine, parts_of(session))):
         lines.append(_SEARCH)
-    if search in ("found", "unexplained") and by_joint:
-        lines.append(_NO_SPRINGS)
     return lines
 
 
