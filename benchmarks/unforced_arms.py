@@ -117,11 +117,12 @@ class Arm:
             for k in range(2)
             if kind in self.declared(k)
         ]
+        asked = {"discover": {"candidates": [self.hidden]}} if self.hidden in ELASTIC else {}
         links, zeros = self.links, [0.0] * 5
         rows = zip(
             (0.0, links.length), links.mass, links.along, links.across, links.about, self.servos, strict=True
         )
-        return {
+        return asked | {
             "plant": {
                 "kind": "serial_arm",
                 "gravity_vector": [0.0, -9.81, 0.0],

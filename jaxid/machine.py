@@ -35,8 +35,8 @@ class Machine:
         hold: Course of the command between samples.
         reference_hold: Course of a logged reference between samples, where the log is slower than the loop.
         unknown_reference: Reference with unknowns, for logs without a reference; None: it is known.
-        load: Known forces in the loop that the plant takes behind those of its drives, at the samples of a
-            log, (time, loads) [N or N m]; None: there are none. See `jaxid.plants.loaded_axis`.
+        load: Known load in the loop that the plant takes behind the forces of its drives, at the samples of a
+            log, (time, loads); None: there is none. See `jaxid.plants.loaded_axis`.
         held_load: The same as means over the ticks of the loop, (ticks, loads), which a simulation then takes
             in place of `load`; None: they are not known so finely.
     """

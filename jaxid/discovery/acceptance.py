@@ -15,7 +15,7 @@ from jaxid.discovery.domain import Domain, ForceDomain, Samples
 from jaxid.discovery.noise import NUMERICS
 from jaxid.discovery.selection import TIE_NATS
 from jaxid.logs.prepare import Prepared
-from jaxid.model.plant import inertia_at
+from jaxid.model.plant import inertia_behind
 from jaxid.numerics.coloured_noise import NoiseModel
 from jaxid.simulation.sensor_noise import force_noise
 
@@ -293,7 +293,7 @@ class Acceptance:
             f = machine.parameters.free[i]
             if f.effect is None or f.path[-1] != "load_inertia" or not plant.effects[f.effect].adds_spring:
                 continue
-            if new[i] > _HEAVIER * inertia_at(plant, int(plant.effects[f.effect].port)):
+            if new[i] > _HEAVIER * inertia_behind(plant, int(plant.effects[f.effect].port)):
                 return f.name
         return ""
 

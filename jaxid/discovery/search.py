@@ -245,13 +245,13 @@ class Search:
             for score in best:
                 model = Model((*model.added, score.candidate), score.refitted)
                 steps.append(self.step(model, added=score, scores=scores, threshold=limit))
+            if self.ends_with(best):
+                return model, steps
             model = self.renewed(model)
             model, dropped = self.drop_superfluous(model, limit, model.added[:-1])
             steps.extend(dropped)
 
             now = frozenset(id(c) for c in model.added)
-            if self.ends_with(best):
-                return model, steps
             if now in tried:  # effects are added and dropped in turn
                 return model, steps
             tried.add(now)

@@ -61,7 +61,10 @@ class HiddenJoints(Plant):
         t: Array,
         states: tuple,
         reaction: Array | None = None,
+        *,
+        behind: bool = False,
     ) -> Balance:
+        # Beside measured joints links count as in front of springs, whatever is asked.
         n = len(self.measured) + q.size
         declared, known = jnp.split(u, [u.size - 3 * len(self.measured)])
         pairs = zip(known.reshape(3, -1), (q, qd, qdd), strict=True)

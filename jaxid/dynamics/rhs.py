@@ -27,7 +27,7 @@ from jaxid.numerics.smooth import ramp, sign
 from jaxid.numerics.tangents import varying
 
 # Traced once for all uses in a step: tracing takes most of the time until a first result.
-balance_of = eqx.filter_jit(lambda plant, *args: plant.balance(*args))
+balance_of = eqx.filter_jit(lambda plant, *args: plant.balance(*args, behind=True))
 
 # Coordinates, velocities, and internal states in one array.
 Split = tuple[Array, Array, Array]

@@ -54,9 +54,9 @@ class Member:
         """Number of commands."""
         return len(self.at.force)
 
-    def rests(self, noise: Float[np.ndarray, " q"]) -> Bool[np.ndarray, " q"]:
-        """Return the mask of the noises that rest at their present floor, from their logarithms."""
-        return noise <= self.problem.low + _AT_FLOOR
+    def rests(self, noise: Float[np.ndarray, " q"], floor: Float[np.ndarray, " q"]) -> Bool[np.ndarray, " m"]:
+        """Return the mask of the forces whose noise rests at a floor, from their logarithms."""
+        return noise[: self.drives] <= floor[: self.drives] + _AT_FLOOR
 
     def slopes(self, scored: Scored) -> Float[np.ndarray, "time k own"]:
         """Return the derivatives of the innovations, over their standard deviations, by the values in SI."""
@@ -153,10 +153,8 @@ class JointLikelihood:
 
     def above(self, floor: int, end: Maximum) -> bool:
         """Check that the noise of every force has come out above one of the floors."""
-        return all(
-            np.all(noise[: m.drives] > m.at.floors[floor][: m.drives] + _AT_FLOOR)
-            for noise, m in zip(end.noises, self.members, strict=True)
-        )
+        pairs = zip(end.noises, self.members, strict=True)
+        return not any(np.any(m.rests(noise, m.at.floors[floor])) for noise, m in pairs)
 
     def at_floor(self, floor: int) -> JointLikelihood:
         """Return the likelihood with one of the floors of the noise."""

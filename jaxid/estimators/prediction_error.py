@@ -310,10 +310,13 @@ def _estimate(fit: JointLikelihood, end: Maximum, corrected: Corrected) -> Estim
             f"the command was computed by the declared law from the logged readings{where}: the logged one "
             "is the same but for white noise of its reading"
         )
-    if any(np.any(m.rests(n)[: m.drives]) for m, n in zip(fit.members, end.noises, strict=True)):
+    pairs = zip(fit.members, end.noises, strict=True)
+    lowest = [m.part.name for m, noise in pairs if np.any(m.rests(noise, np.asarray(m.problem.low)))]
+    if lowest:
+        where = f" (in {', '.join(lowest)})" if several else ""
         notes.append(
-            "the noise of the force came to the lowest value that the filter takes: the standard deviations "
-            "are those at that noise, and larger than necessary if there is less"
+            f"the noise of the force came to the lowest value that the filter allows{where}: if the true "
+            "noise is smaller, the standard deviations are too large"
         )
     if min(min(entry["whiteness"]["p"]) for entry in entries) < REJECTS:
         notes.append(

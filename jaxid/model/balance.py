@@ -68,8 +68,8 @@ class PortSignals(eqx.Module):
         gravity, normal, width = plant.port_gravity(q), plant.port_normal(q), plant.port_width(q)
         return cls(*motion, gravity, normal, width, *plant.port_spring(q), plant.field)
 
-    def at(self, i: int, u: Array, t: Array, dry_scale: Sum) -> Signals:
-        """Return the signals of an effect on port i."""
+    def at(self, i: int, u: Array, t: Array, dry_scale: Sum, *, springs: bool) -> Signals:
+        """Return the signals of an effect on port i, with those of its spring if it adds one."""
         return Signals(
             y=self.y[i],
             yd=self.yd[i],
@@ -83,7 +83,7 @@ class PortSignals(eqx.Module):
             stiffness=self.stiffness[i],
             damping=self.damping[i],
             field=self.field,
-            elongating=None if self.elongating is None else self.elongating[i],
+            elongating=self.elongating[i] if springs and self.elongating is not None else None,
         )
 
 
@@ -136,18 +136,19 @@ def balance(
     states: tuple,
     reaction: Float[Array, " ports"] | None,
     bare: BarePlant | None = None,
+    *,
+    behind: bool = False,
 ) -> Balance:
     """Compute the balance; see `Plant.balance` for the arguments.
 
     Args:
-        plant, q, qd, qdd, u, t, states, reaction: See there.
+        plant, q, qd, qdd, u, t, states, reaction, behind: See there.
         bare: The plant without effects at this motion, if it is known.
     """
     port = PortSignals.of(plant, q, qd, qdd) if bare is None else bare.port
-    # Along a known motion links count as in front of their springs, which is cheaper and near enough there.
-    behind = plant.behind_springs(q, qd, qdd, u, states) if bare is None else None
-    if behind is not None:
-        port = replace(port, elongating=behind.elongating)
+    links = plant.behind_springs(q, qd, qdd, u, states) if behind else None
+    if links is not None:
+        port = replace(port, elongating=links.elongating)
     sums = _Sums.of(plant, port.y.size, u, t)
 
     for run in group_by_kind(plant.effects, sums.drives):
@@ -164,8 +165,8 @@ def balance(
     force = stacked(sums.force) + reaction
     react = _pull_back(plant, q, force) if bare is None else bare.pulled_back(force)
     drive = stacked(sums.drive)
-    if behind is not None:
-        inertial = behind.inertial
+    if links is not None:
+        inertial = links.inertial
     else:
         inertial = plant.inertial(q, qd, qdd) if bare is None else bare.inertial
     residual = inertial - react - plant.applied(drive, q.size)
@@ -233,7 +234,14 @@ def _act(plant: Plant, run: list[int], port: PortSignals, sums: _Sums, t: Array,
     effects = plant.effects
     spots = [(k, i, sums.drives[k]) for k in run for i in plant.directions(effects[k].port)]
     signals = [
-        port.at(i, jnp.zeros(()) if j is None else sums.drive[j], t, sums.dry_scale[i]) for _, i, j in spots
+        port.at(
+            i,
+            jnp.zeros(()) if j is None else sums.drive[j],
+            t,
+            sums.dry_scale[i],
+            springs=effects[k].adds_spring,
+        )
+        for k, i, j in spots
     ]
     each = [k for k, _, _ in spots]
     actions = act_batched([effects[k] for k in each], signals, [states[k] for k in each])

@@ -115,6 +115,10 @@ class Plant(PlantInterface):
         """
         return None
 
+    def links_behind(self, joint: int) -> Array | None:
+        """Return the inertia of the links that a spring at a joint may have behind it; None: not links."""
+        return None
+
     def beyond_springs(
         self, q: Float[Array, " n"], qd: Float[Array, " n"], states: tuple
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]] | None:
@@ -130,6 +134,8 @@ class Plant(PlantInterface):
         t: Float[Array, ""],
         states: tuple,
         reaction: Float[Array, " ports"] | None = None,
+        *,
+        behind: bool = False,
     ) -> Balance:
         """Compute the balance of forces at one instant.
 
@@ -142,11 +148,20 @@ class Plant(PlantInterface):
             states: Internal state of each effect (None if it has none).
             reaction: Force of dry friction by port, if a set-valued step has computed it. Absent:
                 smoothed, -level tanh(yd / width).
+            behind: Whether links are behind springs that effects add to their joints, as in a simulation.
+                Otherwise such a spring has a constant inertia behind it, and the weight acts in front, which
+                is near enough along a measured motion.
 
         Returns:
             Residual `M qdd + h - effects - drive`, levels of dry friction, rates of the states, drive.
         """
-        return balance(self, q, qd, qdd, u, t, states, reaction)
+        return balance(self, q, qd, qdd, u, t, states, reaction, behind=behind)
+
+
+def inertia_behind(plant: Plant, joint: int) -> float:
+    """Return the largest inertia that may be behind a spring which an effect adds to a joint."""
+    links = plant.links_behind(joint)
+    return inertia_at(plant, joint) if links is None else float(np.asarray(links))
 
 
 def inertia_at(plant: Plant, joint: int) -> float:

@@ -59,6 +59,7 @@ class LinkTree(WithLinks):
         actuated: Driven joints, 0-based, in the order of their drives; None: all.
         moments: Pseudo-inertias of the links, (links, 4, 4), as `prepared` computes them from the parameters.
         polynomials: Forces of a chain of few joints, as `prepared` computes them from the parameters.
+        at_zero: Inertia about each joint in the zero position, as `prepared` computes it for springs.
 
     Source:
         `jaxid.plants.rigid_tree`; Khalil & Kleinfinger (1987) for parameters about the origins of modified
@@ -108,6 +109,7 @@ class LinkTree(WithLinks):
     actuated: tuple[int, ...] | None = eqx.field(static=True, default=None, kw_only=True)
     moments: Array | None = eqx.field(default=None, kw_only=True)
     polynomials: FewJoints | None = eqx.field(default=None, kw_only=True)
+    at_zero: Array | None = eqx.field(default=None, kw_only=True)
 
     @property
     def joints(self) -> int:
@@ -208,12 +210,10 @@ class LinkTree(WithLinks):
         edd = small_solve(own, jnp.stack(missing))
         links = before + jnp.sum(columns * edd[:, None], axis=0)
 
-        # In front of a spring are the rotor, and links only as far as they are not behind it.
-        share = dict(zip(joints, parts, strict=True))
-        rows = [
-            (1.0 - share[k]) * before[k] + share[k] * links[k] if k in share else links[k]
-            for k in range(q.size)
-        ]
+        # In front of a spring is that part of the links which is not behind it.
+        share, mean = dict(zip(joints, parts, strict=True)), sum(parts) / len(parts)
+        front = self._of_links_alone(q, qd, qdd)
+        rows = [front[k] + share.get(k, mean) * (links[k] - front[k]) for k in range(q.size)]
         turning = dict(zip(joints, edd, strict=True))
         elongating = [turning.get(k) for k in range(self.ports(q).size)]
         return BehindSprings(jnp.stack(rows) + self._of_rotors(qdd), tuple(elongating))
@@ -249,16 +249,21 @@ class LinkTree(WithLinks):
         return isinstance(effect, AddedSpring) and effect.port < self.joints
 
     def _inertia_at_zero(self, joint: int) -> Array:
-        """Return the inertia of all that turns with a joint in the arm's zero position, without its rotor."""
+        """Return the inertia of the links about a joint in the arm's zero position, without payload."""
+        if self.at_zero is not None:
+            return self.at_zero[joint]
         still, unit = jnp.zeros(self.joints), jnp.asarray(np.eye(self.joints)[joint])
-        force = lambda a: self._of_links_alone(still, still, a)
-        return jax.jvp(force, (still,), (unit,))[1][joint]
+        bare = replace(self, payload=None, moments=None, polynomials=None)
+        return jax.jvp(lambda a: bare._links_force(still, still, a), (still,), (unit,))[1][joint]
 
     def prepared(self) -> Self:
         geometry, moments, polynomials = self.geometry.at_zero(), self._moments(), None
         if self._is_chain and self.joints <= MOST_JOINTS:
             polynomials = FewJoints.of(self.tree, geometry, -self.gravity_vector, moments)
-        return replace(self, geometry=geometry, moments=moments, polynomials=polynomials)
+        at_zero = None
+        if any(map(self._stretches, self.effects)):
+            at_zero = jnp.stack([self._inertia_at_zero(joint) for joint in range(self.joints)])
+        return replace(self, geometry=geometry, moments=moments, polynomials=polynomials, at_zero=at_zero)
 
     @property
     def _is_chain(self) -> bool:

@@ -45,7 +45,8 @@ class Trajectory(eqx.Module):
         command: Logged command, (time, m), before the declared gain.
         reading: Position as the sensor reports it, (time, n).
         found: Estimates of a law that identifies, see `Controller.learned`; None for other laws.
-        links: Position and velocity of links behind springs, (time, n) each; None: they are the joints'.
+        links: Position and velocity of links behind springs, (time, n) each; None: there are none, or the run
+            is no loop.
     """
 
     position: Float[Array, "time n"]
@@ -242,8 +243,8 @@ def closed_loop(
         sensor: Sensor that the controller reads; None: exact readings.
         noise: Standard normal numbers for the noise of the positions and, if there are more
             columns, of the measured commands and the inertial sensors; None: no noise.
-        load: Known forces that the plant takes behind those of its drives, held over each tick [N or N m];
-            None: there are none.
+        load: What the plant takes behind the forces of its drives, held over each tick, see
+            `jaxid.plants.loaded_axis`; None: nothing.
 
     Returns:
         The trajectory, one row per tick.
@@ -351,7 +352,7 @@ def initial_state(
     velocity = jnp.zeros_like(position) if velocity is None else jnp.asarray(velocity, dtype=jnp.float64)
     drives = len(plant.driven(position.size))
     u = jnp.zeros(drives) if force is None else jnp.asarray(force, dtype=jnp.float64)
-    return State(position, velocity, plant.initial_states(u))
+    return State(position, velocity, plant.resting_states(position, u))
 
 
 def with_diffrax(
@@ -391,7 +392,7 @@ def with_diffrax(
             if step_length is not None
             else diffrax.PIDController(rtol=RELATIVE, atol=1e-10)
         )
-    x0 = State(position, velocity, plant.initial_states(force(times[0])))
+    x0 = State(position, velocity, plant.resting_states(jnp.asarray(position), force(times[0])))
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(vector_field),  # pyright: ignore[reportArgumentType]  # its times are arrays
         solver or diffrax.Tsit5(),

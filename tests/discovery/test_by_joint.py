@@ -21,6 +21,7 @@ from jaxid.estimators.apart.joint import joints_alone
 from jaxid.estimators.apart.session import session_of_joint
 from jaxid.estimators.several.parts import part_of, parts_of
 from jaxid.gap import simulation_of_log
+from jaxid.model.effect import Effect
 from jaxid.results.by_joint import joint_rows
 from jaxid.session import open_session
 from tests.support.servo_arm import COULOMB, command, dry, servo_arm_case, servo_arm_log
@@ -85,13 +86,20 @@ def test_a_joint_keeps_its_logs_at_other_values(tmp_path):
         assert np.array_equal(after.machine.load, before.machine.load)
 
 
-def test_no_spring_is_put_between_a_joint_and_its_links():
-    """The load would act before it, where the drive is."""
-    session = open_session(servo_arm_case(dry()), still())
-    plant = joints_alone(session.machine, parts_of(session))[0].machine.plant
-    accepted = {kind for kind, cls in EFFECTS.items() if plant.accepts(cls, 0, 1)}
-    assert not any(EFFECTS[kind].adds_spring for kind in accepted)
-    assert {"load_friction", "coulomb_friction", "saturation", "dead_band"} <= accepted
+def test_a_spring_in_front_of_links_is_tried_on_request_only():
+    """The search takes many times as long with it; a spring without its law for links is not accepted."""
+    for asked in ({}, {"candidates": ["joint_flexibility"]}):
+        session = open_session(servo_arm_case(dry()) | ({"discover": asked} if asked else {}), still())
+        alone = joints_alone(session.machine, parts_of(session))[0]
+        kinds = {cls.kind for cls in unforced.searched(session_of_joint(session, alone), alone.machine)}
+        assert ("joint_flexibility" in kinds) == bool(asked)
+        assert {"load_friction", "coulomb_friction", "saturation", "dead_band"} <= kinds
+
+    class Other(Effect):
+        adds_spring = True
+
+    assert not alone.machine.plant.accepts(Other, 0, 1)
+    assert alone.machine.plant.accepts(EFFECTS["joint_flexibility"], 0, 1)
 
 
 def test_commands_that_rest_are_refused_in_one_line():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jaxid.dynamics.rhs import State, hold_polynomial, step
 from jaxid.estimators.apart.joint import joints_alone
 from jaxid.estimators.apart.loads import with_simulated_loads
 from jaxid.estimators.several.parts import parts_of
@@ -131,7 +132,7 @@ def test_a_joint_alone_moves_as_in_the_whole_arm(joint):
     alone = next(a for a in loaded if a.joint == joint)
     [part] = alone.parts
     held = np.array(part.machine.held_load)
-    held[:, 1:] = [1.0, 0.0]
+    held[:, 1:] = [1.0, 0.0]  # a constant inertia, and no weight
     other = replace(part.machine, held_load=held)
     found = make_replay(other, part.log, numerics)(other.plant)
     off = np.asarray(found.position)[:, 0] - np.asarray(whole.position)[:, joint]
@@ -147,8 +148,9 @@ def test_the_spring_of_a_shaft_has_a_constant_inertia_behind_it():
     rng = np.random.default_rng(0)
     q, qd, qdd = rng.normal(size=(3, 2))
     states, zero = tuple(0.1 * rng.normal(size=(2, 2))), np.zeros(())
-    both = plant.balance(q, qd, qdd, np.zeros(2), zero, states)
-    one = replace(plant, effects=plant.effects[:1]).balance(q, qd, qdd, np.zeros(2), zero, states[:1])
+    both = plant.balance(q, qd, qdd, np.zeros(2), zero, states, behind=True)
+    alone = replace(plant, effects=plant.effects[:1])
+    one = alone.balance(q, qd, qdd, np.zeros(2), zero, states[:1], behind=True)
 
     [e, ed], speed = states[1], np.sqrt(spring.stiffness / spring.load_inertia)
     pull = spring.stiffness * e / speed + spring.damping * ed
@@ -157,3 +159,29 @@ def test_the_spring_of_a_shaft_has_a_constant_inertia_behind_it():
     assert np.allclose(both.residual, one.residual - force * np.array([1.0, 2.0]))
     assert np.allclose(both.rates[1], [speed * ed, -ydd - pull / spring.load_inertia])
     assert np.allclose(both.rates[0], one.rates[0])
+
+
+@pytest.mark.parametrize("part", [0.5, 1.0])
+def test_energy_is_kept_with_a_part_of_the_links_behind_a_spring(part):
+    motion, asked = exact({})
+    plant = opened({0: SPRINGS[0]}, motion, asked).machine.plant
+    spring = plant.effects[-1]
+    spring = replace(spring, damping=np.zeros(()), load_inertia=part * spring.load_inertia)
+    plant = replace(plant, effects=(spring,), gravity_vector=np.zeros(3)).prepared()
+    x = State(np.array([0.3, 0.8]), np.array([2.0, -3.0]), (np.array([0.5, 1.0]),))
+    links = replace(plant, effects=(), rotor_inertia=None)
+    kinetic = lambda q, v: 0.5 * v @ (links.inertial(q, 0 * v, v))
+
+    def energy(x: State) -> float:
+        """Energy of both parts of the links, of the rotors and of the spring."""
+        [e, ed], [w] = np.asarray(x.own[0]), [np.sqrt(spring.stiffness / spring.load_inertia)]
+        ahead = np.array([1.0, 0.0])
+        moving = kinetic(x.q + e / w * ahead, x.qd + ed * ahead)
+        rotors = 0.5 * float(np.sum(np.asarray(plant.rotor_inertia) * x.qd**2))
+        pull = 0.5 * float(spring.stiffness) * (e / w) ** 2
+        return float(part * moving + (1 - part) * kinetic(x.q, x.qd)) + rotors + pull
+
+    before, still = energy(x), hold_polynomial((np.zeros(2),))
+    for _ in range(200):
+        x = step(plant, x, still, np.zeros(()), np.asarray(1e-3))
+    assert abs(energy(x) / before - 1) < 1e-4

@@ -147,6 +147,20 @@ def test_an_arm_whose_loops_shake_it_is_complete_at_the_truth():
     assert [r.complete for r in found] == [True, True]
 
 
+@pytest.mark.slow
+def test_a_search_of_an_arm_that_leaves_more_than_noise_says_what_it_does_not_try():
+    session = arm_at_truth(40_018, gain=0.8)
+    machine, names = session.machine, session.machine.parameters.names
+    known, covariance = np.ones(len(names), bool), 1e-8 * np.eye(len(names))
+    precision = replace(Precision.unknown(names), covariance=covariance, identifiable=known)
+    estimate = Estimate("", machine, machine.parameters.guess, precision, True, "", np.zeros((1, 2)), 1)
+    left = gaps(machine, session.runs)
+    for search in ("found", "unexplained", "nothing_missing", None):
+        findings = judge(session, estimate, left, search).findings
+        said = any("elastic or has clearance is searched for" in line for line in findings)
+        assert said == (search in ("found", "unexplained"))
+
+
 @pytest.mark.parametrize("samples", [1, 2, 4])
 def test_so_few_samples_have_no_systematic_part(samples):
     assert systematic_rms(np.ones(samples), NoiseModel.fit(np.ones(40), np.ones(40, bool))) == 0.0

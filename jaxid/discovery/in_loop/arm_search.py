@@ -160,14 +160,15 @@ class ArmSearch:
         return replace(self, every=list(every.values()), declared=declared), out, gained
 
     def waiting(self, found: Mapping[int, Discovery], searches: Mapping[int, int]) -> list[int]:
-        """Return the joints to search: those that were not, not to the end, and then under other loads.
+        """Return the joints to search: new ones, or where a search ended at a spring, or with other loads.
 
         Args:
             found: Search of each joint that was searched.
             searches: How often each joint was searched.
         """
         new = [joint for joint in self.by_excess if joint not in found]
-        # The first search of a joint ends with a spring, since links behind it load all joints otherwise.
+        # The first search of a joint ends at a spring: links behind it change the loads of all joints, and
+        # the arm is simulated with it before the next one.
         new = new or [joint for joint in self.by_excess if searches[joint] == 1 and _has_spring(found[joint])]
         again = [joint for joint in self.by_excess if searches[joint] < _SEARCHES]
         if new or not again:

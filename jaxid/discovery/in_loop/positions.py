@@ -465,6 +465,16 @@ class LoopSearch(Search):
         answered = float(np.sum(np.where(counts, np.mean(np.square(drawn), axis=0), 0.0)))
         return max(self.acceptance.noise, answered)
 
+    def rest(self, model: Model | None = None) -> list[cand.Candidate]:
+        """Return the candidates that a model may still get: a joint has one added spring at most."""
+        known = (self.model if model is None else model).added
+        sprung = {c.port for c in known if cand.effect_of(self.superset, c).adds_spring}
+        return [
+            c
+            for c in super().rest(model)
+            if not (c.port in sprung and cand.effect_of(self.superset, c).adds_spring)
+        ]
+
     def ends_with(self, best: Sequence[Score]) -> bool:
         """Check for an effect that adds a spring, in a search up to there."""
         return self._adds_spring([s.candidate for s in best])

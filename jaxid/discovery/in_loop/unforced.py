@@ -189,6 +189,8 @@ def explored_from(
     alternatives = {} if search.ended_early else search.alternatives(steps)
     final, effects = final_machine(fitted, search, alternatives, steps)
     progress("refitting in simulation")
+    if search.ended_early:
+        refit = functools.partial(refitted, noise=False)
     after = (refit or refitted)(session, final, base) if effects else before
     if effects:
         kept = [] if refit is not None else _choices(before, "the fit of the declared model")
@@ -256,7 +258,8 @@ def _not_asked(session: Session) -> list[str]:
 def searched(session: Session, machine: Machine) -> list[type[Effect]]:
     """Return the effects that a search without a force tries, those that add a spring last.
 
-    They are those that the case limits it to, or else the ones that say so and those that it asks for.
+    They are those that the case limits it to, or else the ones that say so and those that it asks for. A
+    joint of an arm gets a spring on request only.
     """
     from jaxid.effects import EFFECTS
 
@@ -267,6 +270,9 @@ def searched(session: Session, machine: Machine) -> list[type[Effect]]:
         for kind, cls in EFFECTS.items()
         if (kind in case.kinds if case.kinds else cls.without_force or kind in asked)
     ]
+    if machine.load is not None:
+        # With links behind a spring a search of an arm takes many times as long.
+        kinds = [cls for cls in kinds if not cls.adds_spring or cls.kind in asked or case.kinds]
     rigid = not machine.plant.springs(machine.plant.joints)
     kinds = [cls.of_joint if rigid and cls.of_joint is not None else cls for cls in kinds]
     if any(e.adds_spring for e in machine.plant.effects):
@@ -424,13 +430,14 @@ def _run(replay: Replay, plant: Plant) -> Trajectory:
     return replay(plant)
 
 
-def refitted(session: Session, final: Machine, base: int | None) -> Estimate:
+def refitted(session: Session, final: Machine, base: int | None, *, noise: bool = True) -> Estimate:
     """Refit a machine with what was found, from its values; the scale stays free if nothing gives it.
 
     Args:
         session: Case and logs.
         final: The machine.
         base: Index of the unknown that gave the scale, which `final` holds; None if something known does.
+        noise: Whether the noise of the encoder goes round the loop.
     """
     stated, demands = session.case.output_error, session.case.identification
     options: dict[str, Any] = {"minimiser": stated.minimiser, "hessian": demands.hessian}
@@ -438,7 +445,9 @@ def refitted(session: Session, final: Machine, base: int | None) -> Estimate:
         # A joint of an arm has the load of its links along the log.
         final = session.fit.machine(final)
     fitted = parts_of(session.with_machine(final)) if session.more else session.fit.log
-    held = run_alone(fitted_with_noise(final, fitted, final.parameters.guess, **options))
+    held = None
+    if noise:
+        held = run_alone(fitted_with_noise(final, fitted, final.parameters.guess, **options))
     if held is None:
         held = run_alone(output_error_steps(final, fitted, start=None, **options))
     if base is None:

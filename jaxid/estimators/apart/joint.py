@@ -30,6 +30,8 @@ from jaxid.plants.link_tree import LinkTree
 from jaxid.plants.loaded_axis import LoadedAxis
 from jaxid.sensors.encoder import Sensor
 
+# Most rows of a log at which the inertia of a joint's links is taken for its mean.
+_ROWS = 200
 # Unknown inertias of the rotors among the parameters of a tree.
 ROTOR = "rotor_inertia"
 
@@ -44,7 +46,7 @@ class JointAlone:
         parts: The logs with their machines and loads.
         index: Number of each of its unknowns among those of the arm, (own,).
         links: Mean inertia of the links about the joint [kg m^2 or kg], a part of its machine's.
-        at_zero: That in the arm's zero position.
+        at_zero: Inertia of the links about it in the arm's zero position, without payload.
         ratio: Inertia at the joint for one of its rotor, the square of its gear.
         others: Logs that are not fitted.
     """
@@ -144,10 +146,10 @@ def joints_alone(machine: Machine, parts: Sequence[Part], others: Sequence[Part]
     """
     loads, inertias = [], []
     for part in (*parts, *others):
-        force, own = of_links(links_of(part.machine), *(getattr(part.data, n) for n in ("q", "qd", "qdd")))
-        loads.append(np.asarray(force))
-        inertias.append(np.asarray(own))
-    means = np.mean(np.concatenate(inertias[: len(parts)]), axis=0)
+        links, data = links_of(part.machine), part.data
+        loads.append(np.asarray(of_links(links, data.q, data.qd, data.qdd)))
+        inertias.append(np.asarray(inertias_of_links(links, data.q)))
+    means = _mean(inertias[: len(parts)])
     at_zero = inertias_at_zero(machine)
     names = machine.parameters.names
     out = []
@@ -161,17 +163,22 @@ def joints_alone(machine: Machine, parts: Sequence[Part], others: Sequence[Part]
         for part, force, own_inertia in zip((*parts, *others), loads, inertias, strict=True):
             of_joint = (part.data.qdd[:, joint], force[:, joint], own_inertia[:, joint])
             load = load_of(*of_joint, mean=means[joint], at_zero=at_zero[joint])
-            one = _machine(part.machine, joint, means[joint], load)
+            one = _machine(part.machine, joint, (means[joint], at_zero[joint]), load)
             index = np.array([own.index(name) for name in one.parameters.names], dtype=int)
             alone.append(Part(part.name, _log(part, joint), one, index, _prepared(part.data, joint)))
         assert alone[0].machine.load is not None, "a joint alone has one"
-        whole = _machine(machine, joint, means[joint], alone[0].machine.load)
+        whole = _machine(machine, joint, (means[joint], at_zero[joint]), alone[0].machine.load)
         index = np.array([names.index(name) for name in own])
         ratio = float(gear_squares(machine.plant)[joint])
         fitted, beside = tuple(alone[: len(parts)]), tuple(alone[len(parts) :])
-        inertias_of_links = (float(means[joint]), float(at_zero[joint]))
-        out.append(JointAlone(joint, whole, fitted, index, *inertias_of_links, ratio, beside))
+        of_its_links = (float(means[joint]), float(at_zero[joint]))
+        out.append(JointAlone(joint, whole, fitted, index, *of_its_links, ratio, beside))
     return out
+
+
+def _mean(inertias: Sequence[Float[np.ndarray, "time n"]]) -> Float[np.ndarray, " n"]:
+    """Return the mean of inertias along logs, each at some of its rows."""
+    return np.mean(np.concatenate([rows[:: max(1, len(rows) // _ROWS)] for rows in inertias]), axis=0)
 
 
 def load_of(
@@ -221,15 +228,15 @@ def mean_inertias(machine: Machine, data: Prepared) -> Float[np.ndarray, " n"]:
     """Return the mean inertia of each joint of an arm along a log, that of its rotor included, (n,)."""
     plant = machine.plant
     assert isinstance(plant, LinkTree), "an arm has links"
-    _, links = of_links(links_of(machine), data.q, data.qd, data.qdd)
+    links = inertias_of_links(links_of(machine), data.q)
     rotors = 0.0 if plant.rotor_inertia is None else gear_squares(plant) * np.asarray(plant.rotor_inertia)
-    return np.mean(np.asarray(links), axis=0) + rotors
+    return _mean([np.asarray(links)]) + rotors
 
 
 def inertias_at_zero(machine: Machine) -> Float[np.ndarray, " n"]:
-    """Return the inertia of the links about each joint in an arm's zero position, (n,)."""
-    still = jnp.zeros((1, machine.plant.joints))
-    return np.asarray(of_links(links_of(machine), still, still, still)[1])[0]
+    """Return the inertia of the links about each joint in an arm's zero position, without payload, (n,)."""
+    links = replace(links_of(machine), payload=None)
+    return np.asarray(inertias_of_links(links, jnp.zeros((1, machine.plant.joints))))[0]
 
 
 def gear_squares(plant: Any) -> np.ndarray:
@@ -238,23 +245,38 @@ def gear_squares(plant: Any) -> np.ndarray:
 
 
 @kept_jit
-def of_links(plant: LinkTree, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
-    """Return the forces of the links along a motion, and their inertia about each joint, (time, n) each."""
+def of_links(plant: LinkTree, q: Array, qd: Array, qdd: Array) -> Array:
+    """Return the forces of the links along a motion, (time, n)."""
+    return jax.vmap(plant.inertial)(q, qd, qdd)
+
+
+@kept_jit
+def inertias_of_links(plant: LinkTree, q: Array) -> Array:
+    """Return the inertia of the links about each joint at some positions, (time, n)."""
     zero = jnp.zeros(q.shape[1])
 
     def own(q: Array) -> Array:
         return jnp.diagonal(jax.jacfwd(lambda a: plant.inertial(q, zero, a))(zero))
 
-    return jax.vmap(plant.inertial)(q, qd, qdd), jax.lax.map(own, q)
+    return jax.lax.map(own, q)
 
 
-def _machine(machine: Machine, joint: int, links: float, load: Float[np.ndarray, "time 3"]) -> Machine:
-    """Return the machine of a joint, with its unknowns, whose links have a constant inertia."""
+def _machine(
+    machine: Machine, joint: int, of_links: tuple[float, float], load: Float[np.ndarray, "time 3"]
+) -> Machine:
+    """Return the machine of a joint, with its unknowns, whose links have a constant inertia.
+
+    Args:
+        machine: Machine of the arm.
+        joint: The joint, from 0.
+        of_links: Inertia of the links about it: the constant one, and that in the zero position.
+        load: Load of the joint, see `load_of`.
+    """
     plant, law = machine.plant, machine.controller
     assert isinstance(plant, LinkTree), "checked by stands_apart"
     assert law is not None, "checked by stands_apart"
     drive = plant.driven(plant.joints).index(joint)
-    ratio, rotors = gear_squares(plant)[joint], plant.rotor_inertia
+    (links, at_zero), ratio, rotors = of_links, gear_squares(plant)[joint], plant.rotor_inertia
     rotor = 0.0 if rotors is None else ratio * float(np.asarray(rotors)[joint])
 
     effects: tuple[Effect, ...] = tuple(replace(e, port=0) for e in plant.effects if e.port == joint)
@@ -264,7 +286,9 @@ def _machine(machine: Machine, joint: int, links: float, load: Float[np.ndarray,
     free = [_free(f, machine, joint, links, ratio) for f in own]
     return replace(
         machine,
-        plant=LoadedAxis(jnp.asarray(links + rotor), effects=effects, smoothing=smoothing),
+        plant=LoadedAxis(
+            jnp.asarray(links + rotor), mean=links, at_zero=at_zero, effects=effects, smoothing=smoothing
+        ),
         parameters=Parameters(tuple(free)),
         gain=np.asarray(machine.gain)[drive : drive + 1],
         units=replace(machine.units, motion=plant.motion(joint) or machine.units.motion),

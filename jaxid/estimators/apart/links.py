@@ -143,7 +143,7 @@ def _rows(
     counts = rows_in_motion(log, v)
 
     def force(theta: np.ndarray) -> np.ndarray:
-        return np.asarray(of_links(links_of(part.at(theta)), data.q, data.qd, data.qdd)[0])[:, joint]
+        return np.asarray(of_links(links_of(part.at(theta)), data.q, data.qd, data.qdd))[:, joint]
 
     known, columns = force(theta), []
     for k in unknown:

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxid.estimators.apart.joint import JointAlone, links_of, load_of, of_links
+from jaxid.estimators.apart.joint import JointAlone, inertias_of_links, links_of, load_of, of_links
 from jaxid.estimators.several.parts import Part
 from jaxid.logs.prepare import motion
 from jaxid.machine import Machine
@@ -101,7 +101,8 @@ class _Motions:
         apart = (q, v) if run.links is None else tuple(np.asarray(x) for x in run.links)
         middle, speed = (np.concatenate([0.5 * (x[1:] + x[:-1]), x[-1:]]) for x in apart)
         of_joints, a = (np.diff(x, axis=0, append=x[-1:]) / law.period for x in (v, apart[1]))
-        force, inertia = (np.asarray(x) for x in of_links(links, middle, speed, a))
+        force = np.asarray(of_links(links, middle, speed, a))
+        inertia = np.asarray(inertias_of_links(links, middle))
 
         recipe, rows = part.data.recipe, q[:: replay.every]
         seen = motion(
@@ -114,7 +115,7 @@ class _Motions:
             np.where(unexplained, x, y)
             for x, y in zip((part.data.q, part.data.qd, part.data.qdd), seen, strict=True)
         ]
-        more = measured[2] - seen[2], np.asarray(of_links(links, *measured)[0] - of_links(links, *seen)[0])
+        more = measured[2] - seen[2], np.asarray(of_links(links, *measured) - of_links(links, *seen))
         times = log.time[0] + law.period * (np.arange(len(q)) + 0.5)
         at_ticks = (reference_at(log.time, x, times, "linear") for x in more)
         return cls((a, force), (next(at_ticks), next(at_ticks)), inertia, of_joints - a)

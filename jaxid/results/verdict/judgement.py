@@ -11,6 +11,7 @@ from jaxid.consistency.absent import known_forces
 from jaxid.consistency.clipped import SEEMS
 from jaxid.consistency.force_reading import ForceReading
 from jaxid.consistency.law import law_of_rows
+from jaxid.effects import EFFECTS
 from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.force_timing import delay_words
@@ -41,6 +42,13 @@ _SLIGHT = 0.05
 # Most sentences on single values; further ones are counted.
 _MOST = 6
 _SEARCH = "The command jaxid discover searches for what is missing."
+
+# Of an arm without a force, which is searched joint by joint.
+_NO_SPRINGS = (
+    "A drive that is elastic or has clearance is searched for at a joint of an arm without a force on "
+    'request only, as such a search takes long (candidates = ["joint_flexibility"] in [discover]): other '
+    "effects may be named in its place, as an unbalance or a constant force."
+)
 
 
 @dataclass(frozen=True)
@@ -344,9 +352,13 @@ def _completeness_words(
     )
     lines += _loop_words(session)
     machine = session.machine
-    searched = not (machine.unforced(session.fit.log) and machine.plant.coupled)
-    if search == "none" and (searched or stands_apart(machine, parts_of(session))):
+    by_joint = stands_apart(machine, parts_of(session))
+    if search == "none" and (by_joint or not (machine.unforced(session.fit.log) and machine.plant.coupled)):
         lines.append(_SEARCH)
+    asked = {*session.case.kinds, *(effect.kind for effect in session.case.candidates)}
+    springs = any(EFFECTS[kind].adds_spring for kind in asked if kind in EFFECTS)
+    if search in ("found", "unexplained") and by_joint and not springs:
+        lines.append(_NO_SPRINGS)
     return lines
 
 
