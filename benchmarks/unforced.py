@@ -6,10 +6,9 @@
 Coverage: the share of 95 % intervals that hold the truth, from guesses up to three times off, and for arms
 two to five times off. Hidden: one effect that the case does not declare, with what an oracle sees of it; on
 an arm of two joints it acts at one of them. Elastic: arms with a spring at one joint, for which the case
-asks. Nulls: complete cases, in
-which nothing should be named. The runs of a part have the numbers from --first (0) to below N. They are
-written to DIR/unforced.jsonl as they end; a second call goes on from there, and rewrites DIR/unforced.md from
-all of them. --seconds ends a call after so much time.
+asks. Nulls: complete cases, in which nothing should be named. The runs of a part have the numbers from
+--first (0) to below N. They are written to DIR/unforced.jsonl as they end; a second call goes on from there,
+and rewrites DIR/unforced.md from all of them. --seconds ends a call after so much time.
 """
 
 import argparse

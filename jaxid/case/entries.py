@@ -322,7 +322,8 @@ def search_keys(root: Spot, kinds: Kinds) -> dict[str, Key]:
     def candidate(value: Any, spot: Spot) -> type[Effect]:
         kind = text(value, spot)
         found = effects.get(kind)
-        if found and (found.on_request or found.without_force_on_request or found.in_links):
+        by_place = found and (found.in_links or found.adds_spring)  # on request at some machines
+        if found and (by_place or found.on_request or found.without_force_on_request):
             return found
         if kind in effects:
             raise spot.refuse(kind, "takes part in every search", "leave it out")

@@ -31,6 +31,7 @@ _OF_EFFECTS = (
     "on_request",
     "without_force_on_request",
     "in_links",
+    "adds_spring",
     "with_springs",
     "of_spring",
     "in_drive",
