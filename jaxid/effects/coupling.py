@@ -59,7 +59,8 @@ class JointFlexibility(AddedSpring):
     """Part of the inertia, J, sits behind a spring: k e + d e' - (-J a) on the joint.
 
     e is the elongation of the spring: J (a + e'') = -k e - d e'. The inertia of the plant stays that of the
-    whole; the effect subtracts its part J and adds the pull of the spring. The state is e times the spring's
+    whole; the effect subtracts its part J and adds the pull of the spring. In the simulation of an arm the
+    plant does so, with the links behind the spring; see `LinkTree`. The state is e times the spring's
     frequency, and e': both have one size. With a clearance in series no force passes while |e| < gap / 2, and
     e less that half counts beyond: backlash between a motor with its encoder and its load.
     """
