@@ -114,7 +114,8 @@ def test_a_simulated_arm_is_the_exact_one(springs, near):
     assert np.abs(motion["links"][0] - motion["position"][0]).max() > 2e-3
 
 
-@pytest.mark.parametrize("joint", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("joint", [0, 1])
 def test_a_joint_alone_moves_as_in_the_whole_arm(joint):
     """Its load is that of the links, with their inertia, behind its spring."""
     springs = {joint: SPRINGS[joint]}

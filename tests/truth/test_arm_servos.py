@@ -84,7 +84,7 @@ def test_an_effect_is_that_of_the_exact_axis(kind):
     assert np.abs(without - axis).max() > 1e-3
 
 
-@pytest.mark.parametrize("gap", [0.0, 0.04])
+@pytest.mark.parametrize("gap", [pytest.param(0.0, marks=pytest.mark.slow), 0.04])
 def test_an_elastic_joint_is_that_of_the_exact_chain(gap):
     """At an arm whose second link weighs nothing beside the first, and without weight."""
     from truth.axis.stepper import Loop, Sensor
