@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -287,7 +287,8 @@ class AddedSpring(Effect):
 
     adds_spring = True
 
-    load_inertia: eqx.AbstractVar[Array]
+    if TYPE_CHECKING:  # a field here would be the first parameter of every subclass
+        load_inertia: Array
 
     def spring(self, state: Any) -> tuple[Array, Array, Array]:
         """Return elongation, its rate, and the pull of the spring on the joint, from the internal state."""

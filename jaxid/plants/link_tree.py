@@ -189,8 +189,8 @@ class LinkTree(WithLinks):
     ) -> BehindSprings | None:
         """Return the forces of the arm with links behind springs, each by its own.
 
-        An inertia J behind the spring of a joint stands for J / M of all that turns with the joint, M being
-        the inertia of that in the arm's zero position. With all of it behind, the rotor alone is in front.
+        An inertia J behind the spring of a joint stands for the part J / M of the links that turn with the
+        joint. M is their inertia in the arm's zero position. If J = M, the rotor alone is in front.
         The spring of a shaft has a constant inertia behind it.
         """
         springs = self._springs(states)
@@ -248,6 +248,10 @@ class LinkTree(WithLinks):
     def _stretches(self, effect: Effect) -> TypeGuard[AddedSpring]:
         return isinstance(effect, AddedSpring) and effect.port < self.joints
 
+    def inertias_at_zero(self) -> Float[Array, " n"]:
+        """Return the inertia of the links about each joint in the arm's zero position, without payload."""
+        return jnp.stack([self._inertia_at_zero(joint) for joint in range(self.joints)])
+
     def _inertia_at_zero(self, joint: int) -> Array:
         """Return the inertia of the links about a joint in the arm's zero position, without payload."""
         if self.at_zero is not None:
@@ -262,7 +266,7 @@ class LinkTree(WithLinks):
             polynomials = FewJoints.of(self.tree, geometry, -self.gravity_vector, moments)
         at_zero = None
         if any(map(self._stretches, self.effects)):
-            at_zero = jnp.stack([self._inertia_at_zero(joint) for joint in range(self.joints)])
+            at_zero = self.inertias_at_zero()
         return replace(self, geometry=geometry, moments=moments, polynomials=polynomials, at_zero=at_zero)
 
     @property

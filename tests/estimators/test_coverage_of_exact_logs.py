@@ -108,6 +108,7 @@ def test_the_noise_of_a_force_that_the_law_explains_falls_below_the_floors_befor
         fit = jaxid.identify(path, log).estimate
         assert fit.converged
         noise.append(fit.details["noise"]["force"][0] / np.std(log["u"]))
+        assert any("came to the lowest value that the filter allows" in note for note in fit.notes)
     # Where a fit at the lowest floor does not converge, that of the floor before counts.
     assert noise[0] < 0.5e-5
     assert noise[1] < 2e-5

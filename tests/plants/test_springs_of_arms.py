@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from jaxid.dynamics.rhs import State, hold_polynomial, step
+from jaxid.effects import EFFECTS
 from jaxid.estimators.apart.joint import joints_alone
 from jaxid.estimators.apart.loads import with_simulated_loads
 from jaxid.estimators.several.parts import parts_of
+from jaxid.plants.loaded_axis import LoadedAxis
 from jaxid.session import open_session
 from jaxid.simulation.replay import Numerics, make_replay
 from truth.arm.servos import Links, Servo, run
@@ -191,3 +193,18 @@ def test_energy_is_kept_with_a_part_of_the_links_behind_a_spring(part):
     )(x)
     assert abs(energy(after) / energy(x) - 1) < 1e-4
     assert abs(after.q[0] - x.q[0]) > 0.1
+
+
+def test_the_rotor_alone_is_in_front_of_links_that_fold():
+    """Their inertia is then beyond the mean and the rotor together."""
+    spring = EFFECTS["joint_flexibility"](40.0, 0.1, 0.06)
+    plant = LoadedAxis(0.05, mean=0.04, at_zero=0.06, effects=(spring,))
+    still, states = np.zeros(1), (np.array([0.2, 0.3]),)
+    load = np.array([0.0, 0.7, 1.4, 2.0])
+
+    def residual(acceleration: float) -> float:
+        motion = (still, still, np.array([acceleration]))
+        return float(plant.balance(*motion, load, np.zeros(()), states, behind=True).residual[0])
+
+    assert np.isclose(residual(1.0) - residual(0.0), 0.05 - 0.04)
+    assert np.isclose(residual(0.0), -float(spring.spring(states[0])[2]))

@@ -150,7 +150,7 @@ def joints_alone(machine: Machine, parts: Sequence[Part], others: Sequence[Part]
         loads.append(np.asarray(of_links(links, data.q, data.qd, data.qdd)))
         inertias.append(np.asarray(inertias_of_links(links, data.q)))
     means = _mean(inertias[: len(parts)])
-    at_zero = inertias_at_zero(machine)
+    at_zero = np.asarray(_inertias_at_zero(links_of(machine)))
     names = machine.parameters.names
     out = []
     for joint in range(machine.plant.joints):
@@ -233,12 +233,6 @@ def mean_inertias(machine: Machine, data: Prepared) -> Float[np.ndarray, " n"]:
     return _mean([np.asarray(links)]) + rotors
 
 
-def inertias_at_zero(machine: Machine) -> Float[np.ndarray, " n"]:
-    """Return the inertia of the links about each joint in an arm's zero position, without payload, (n,)."""
-    links = replace(links_of(machine), payload=None)
-    return np.asarray(inertias_of_links(links, jnp.zeros((1, machine.plant.joints))))[0]
-
-
 def gear_squares(plant: Any) -> np.ndarray:
     """Return the square of each joint's gear ratio."""
     return np.ones(plant.joints) if plant.gear_ratio is None else np.asarray(plant.gear_ratio) ** 2
@@ -248,6 +242,11 @@ def gear_squares(plant: Any) -> np.ndarray:
 def of_links(plant: LinkTree, q: Array, qd: Array, qdd: Array) -> Array:
     """Return the forces of the links along a motion, (time, n)."""
     return jax.vmap(plant.inertial)(q, qd, qdd)
+
+
+@kept_jit
+def _inertias_at_zero(plant: LinkTree) -> Array:
+    return plant.inertias_at_zero()
 
 
 @kept_jit
