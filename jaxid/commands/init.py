@@ -23,6 +23,7 @@ from jaxid.first_case.flexible_draft import FlexibleDraft
 from jaxid.first_case.gains import with_gains
 from jaxid.first_case.joints import NO_FORCE_HINT, most_moved, need_forces, of_robot
 from jaxid.first_case.raw import raw_log
+from jaxid.first_case.reference import beside_reference
 from jaxid.first_case.section import Section, case_text
 from jaxid.first_case.servo import loop_of_servos, servos_of
 from jaxid.first_case.units import measures_of
@@ -158,7 +159,10 @@ def init(
 
     motion = "" if robot is None else _motion_of(robot, next(iter(chosen.joints)))
     kind = Draft if chosen.load is None else FlexibleDraft
-    draft = kind(log, raw, chosen, measures_of(chosen, motion), Path(folder))
+    measures = measures_of(chosen, motion)
+    if robot is None:
+        measures = beside_reference(chosen, measures)
+    draft = kind(log, raw, chosen, measures, Path(folder))
     if robot is not None:
         key = "urdf" if mjcf is None else "mjcf"
         own_loop = not chosen.force and not servos_of(robot, chosen.joints)

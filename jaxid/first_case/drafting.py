@@ -239,6 +239,8 @@ class Draft:
             section.keys["units"] = {q: u for q, u in measures.units.items() if q in section.keys}
         if not section.keys.get("units", True):
             del section.keys["units"]
+        if measures.sign:
+            section.keys["sign"] = dict(measures.sign)
         if measures.unwrap:
             section.keys["unwrap"] = measures.unwrap
         if measures.counts is not None:
@@ -398,7 +400,7 @@ class Draft:
     def _read(self, table: Section, drive: Section | None = None) -> Log:
         """Read the log as the case will, with the ratio of a gear if there is one."""
         columns = {
-            key: list(value.values()) if isinstance(value, dict) and key != "units" else value
+            key: list(value.values()) if isinstance(value, dict) and key not in ("units", "sign") else value
             for key, value in table.keys.items()
         }
         driven = self.driven
@@ -406,7 +408,7 @@ class Draft:
             motions=self._motions,
             driven=driven,
             labels=self._measures.labels,
-            actuator=Actuator() if drive is None else Actuator(gear_ratio=drive.keys["gear_ratio"]),
+            actuator=Actuator() if drive is None else Actuator(**drive.keys),
         )
         if self._empty():
             # A text table has such readings by itself; in other formats the case must say so.
@@ -452,7 +454,7 @@ def driven_balance(rough: RoughBalance, table: Section) -> RoughBalance:
     """Return the balance with the force turned if it brakes as logged, and say so in the table of the log."""
     if not rough.braked:
         return _plausible(rough)
-    table.keys["sign"] = {"force": -1}
+    table.keys["sign"] = {**table.keys.get("sign", {}), "force": -1}
     table.assumed.append("the force as logged brakes the motion: its sign is turned")
     table.questions.append("is a positive force one that drives a positive velocity?")
     weight = None if rough.weight is None else (-rough.weight[0], -rough.weight[1])

@@ -10,7 +10,8 @@ from jaxid.first_case.balance import rough_balance
 from jaxid.first_case.columns import Column
 from jaxid.first_case.drafting import Draft, driven_balance, positive_friction
 from jaxid.first_case.section import Section, rounded
-from jaxid.first_case.two_encoders import ratio_of_strokes
+from jaxid.first_case.two_encoders import by_screw
+from jaxid.logs.rough_inertia import ratio_of_strokes
 
 # Resonance of a coupling [Hz] and its damping ratio that nothing states.
 _RESONANCE, _DAMPED = 20.0, 0.05
@@ -94,33 +95,58 @@ class FlexibleDraft(Draft):
         ]
 
     def _gear(self, table: Section) -> Section | None:
-        """Return the table of a gear between two encoders; None if there is none."""
+        """Return the table of a gear or a screw between two encoders; None if there is none."""
         [motor], load = self._chosen.position, self._load
-        slope = ratio_of_strokes(motor.values, load.values)
+        slope = ratio_of_strokes(motor.values, load.values).ratio
         slope *= self._factor("position") / self._factor("load_position")
+        if slope < 0:
+            table.keys["sign"] = {**table.keys.get("sign", {}), "load_position": -1}
+            table.assumed.append(f"'{load.name}' moves against '{motor.name}': its sign is turned")
+            table.questions.append(f"do '{load.name}' and '{motor.name}' count in opposite directions?")
+        slope = abs(slope)
+        if by_screw(motor, load):
+            return self._screw(slope, table)
         if 1 / _GEARED < slope < _GEARED:
             return None
-        whole = round(slope)
-        ratio = float(whole) if whole and abs(slope / whole - 1) < _WHOLE else rounded(slope, 5)
-        table.keys["position_at"] = "motor"
+        ratio = _near_whole(slope)
         drive = Section("[actuator]", {"gear_ratio": ratio})
         drive.assumed.append(f"the motor turns {slope:.6g} times as far as the load")
         drive.questions.append("is this the ratio of the gear?")
-        labelled = "force" in self._measures.labels
-        drive.keys["gain"] = 1.0 if labelled else ratio
-        if not labelled:
-            question = "is the force that of the motor? If it is that behind the gear, gain = 1.0"
-            drive.questions.append(question)
+        self._of_motor(drive, ratio, table)
         near = next((name for unit, name in _UNITS.items() if abs(slope / unit - 1) < _NEAR), "")
         if near:
             drive.questions.append(f"or are the units of the two positions not the same ({near})?")
-        reference = self._chosen.reference
-        if reference and self._of_load_side(reference[0], motor, ratio):
+        return drive
+
+    def _screw(self, slope: float, table: Section) -> Section:
+        """Return the table of a screw, rack or belt that turns an angle into a way.
+
+        Args:
+            slope: Angle of the motor for a way of the load [rad/m].
+            table: The table of the log.
+        """
+        lead = 1e-3 * _near_whole(1e3 * 2 * np.pi / slope)
+        drive = Section("[actuator]", {"gear_ratio": 1.0, "lead": rounded(lead, 6)}, {"lead": "m/rev"})
+        drive.assumed.append(f"the load moves {1e3 * 2 * np.pi / slope:.6g} mm in a turn of the motor")
+        drive.questions.append("is this the lead of the screw, or the way of rack or belt in a turn?")
+        self._of_motor(drive, 2 * np.pi / lead, table)
+        return drive
+
+    def _of_motor(self, drive: Section, ratio: float, table: Section) -> None:
+        """State that position and force are the motor's, in front of a gear of a ratio."""
+        [motor], reference = self._chosen.position, self._chosen.reference
+        table.keys["position_at"] = "motor"
+        labelled = "force" in self._measures.labels
+        drive.keys["gain"] = 1.0 if labelled else rounded(ratio, 6)
+        if not labelled:
+            drive.questions.append(
+                "is the force that of the motor? If it is that behind the gear, gain = 1.0"
+            )
+        if reference and not by_screw(motor, reference[0]) and self._of_load_side(reference[0], motor, ratio):
             del table.keys["reference"]
             table.keys.get("units", {}).pop("reference", None)
             table.offers.clear()
             table.assumed.append(f"'{reference[0].name}' is not used: it moves as far as the load")
-        return drive
 
     def _of_load_side(self, reference: Column, motor: Column, ratio: float) -> bool:
         """Check that a reference moves as far as the load, and not as its motor."""
@@ -145,3 +171,9 @@ class FlexibleDraft(Draft):
             '"0.018 deg" } the case can be one of kind = "flexible_axis" (docs/case_file.md)'
         )
         return sections
+
+
+def _near_whole(ratio: float) -> float:
+    """Return the whole number that is near a ratio; the ratio itself if none is."""
+    whole = round(ratio)
+    return float(whole) if whole and abs(ratio / whole - 1) < _WHOLE else rounded(ratio, 5)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from jaxid.first_case.columns import Chosen, Column
+from jaxid.first_case.two_encoders import by_screw
 from jaxid.logs.rough_inertia import correlation, smooth, windows
 from jaxid.logs.units import fits, parse_unit
 from jaxid.logs.units_check import time_unit_of
@@ -38,7 +40,7 @@ _NEAR = 1.08
 _SIMILAR = 0.9
 # Unit of a position by the turn after which it starts anew.
 _BY_TURN = {"2 pi": "rad", "pi": "rad", "360": "deg", "180": "deg"}
-_SI = {"": "", "linear": "m", "rotary": "rad"}
+SI = {"": "", "linear": "m", "rotary": "rad"}
 # Label of a drive's command by its kind, where its force is not known.
 _LABELS = {"current": "A", "voltage": "V", "duty": "pwm", "command": "command", "load": "load", "": "command"}
 
@@ -53,6 +55,7 @@ class Measures:
         labels: `[plant] units`, by quantity, where a quantity is not mechanical.
         unwrap: `[log] unwrap`; False: positions go on.
         counts: `[log] counts_per_revolution`; None: not known, or positions are in another unit.
+        sign: `[log] sign`, by quantity.
         said: Lines on everything that was assumed.
         questions: Doubts, by quantity.
     """
@@ -64,6 +67,7 @@ class Measures:
     said: tuple[str, ...]
     questions: dict[str, str]
     counts: int | None = None
+    sign: Mapping[str, int] = field(default_factory=dict)
 
 
 def measures_of(chosen: Chosen, robot: str = "") -> Measures:
@@ -95,9 +99,12 @@ def measures_of(chosen: Chosen, robot: str = "") -> Measures:
     per_turn = round(wrap.turn) if counts and wrap is not None and round(wrap.turn) < _REGISTER else None
     if chosen.position and chosen.velocity and not counts and wrap is None:
         position, velocity = _by_slope(chosen, period, position, velocity, said)
+    screw = chosen.load is not None and by_screw(place, chosen.load)
     motion = "rotary"
     if robot:
         motion = robot
+    elif screw:
+        motion = "linear"
     elif not counts:
         motion = _motion(chosen, place, position or velocity, wrap is not None, said, questions)
 
@@ -115,14 +122,15 @@ def measures_of(chosen: Chosen, robot: str = "") -> Measures:
     elif position:
         _state("position", position, units, said, place if chosen.position else None)
     elif chosen.position:
-        unit = "rad, or m where a joint slides" if robot else _SI[motion]
+        unit = "rad, or m where a joint slides" if robot else SI[motion]
         said.append(f"the position is taken to be in {unit}: nothing states its unit")
     if chosen.velocity and velocity not in ("", _unknown()):
         units["velocity"] = velocity
     if robot and chosen.force and _of_robot(chosen.force[0]):
         said.append(_of_robot(chosen.force[0]))
     else:
-        _force(chosen, motion, units, labels, said, questions)
+        # The motor of a screw turns.
+        _force(chosen, "rotary" if screw else motion, units, labels, said, questions)
     if chosen.reference:
         own = _stated(chosen.reference[0], "position")
         own = "" if counts and per_turn is None else own or units.get("position", "")
@@ -130,9 +138,10 @@ def measures_of(chosen: Chosen, robot: str = "") -> Measures:
     if chosen.load is not None:
         of_load = _stated(chosen.load, "position") or units.get("position", "")
         units |= {"load_position": of_load} if of_load else {}
+    plain = ("s", "m", "N", "N m") if motion == "linear" else ("s", "m", "rad", "N", "N m")
     return Measures(
         motion,
-        {q: u for q, u in units.items() if u not in ("s", "m", "rad", "N", "N m")},
+        {q: u for q, u in units.items() if u not in plain},
         labels,
         False if wrap is None else (True if wrap.name else wrap.turn),
         tuple(said),

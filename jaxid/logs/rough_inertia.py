@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 # A force of which the acceleration explains less than this part comes from the controller: a spring and a
 # damper to a constant reference. It does not determine the inertia.
 _SHARE = 0.01
+# Velocity below which a sample counts as at rest, over the largest one, and fewest samples of a fit.
+_REST, _ENOUGH = 0.02, 20
 
 Signal: TypeAlias = "Float[np.ndarray, ' samples']"
 
@@ -50,6 +52,49 @@ def correlation(one: Signal, other: Signal) -> float:
     one, other = one - one.mean(), other - other.mean()
     scale = float(np.sqrt((one @ one) * (other @ other)))
     return float(one @ other) / scale if scale > 0 else 0.0
+
+
+class Strokes(NamedTuple):
+    """How far one position moves beside another.
+
+    Args:
+        ratio: Way of the first over that of the second; negative if they move against each other.
+        left: Part of the variance of the first that its fit leaves.
+    """
+
+    ratio: float
+    left: float
+
+
+def ratio_of_strokes(first: Signal, second: Signal) -> Strokes:
+    """Estimate how many times as far one position moves as another, which it follows or is joined to.
+
+    A coupling gives, and a loop lags, with acceleration and friction, which stand beside the second position
+    in a fit. Of all running means the one that leaves least of the first position decides.
+
+    Args:
+        first, second: Two positions of one length.
+    """
+    best = Strokes(0.0, np.inf)
+    for window in windows(second.size - 2):
+        signals = (
+            first[1:-1],
+            second[1:-1],
+            (second[2:] - second[:-2]) / 2.0,
+            second[2:] - 2 * second[1:-1] + second[:-2],
+        )
+        q, x, v, a = (smooth(s, window) for s in signals)
+        if q.size <= _ENOUGH or q.std() == 0:
+            continue
+        moves = np.where(np.abs(v) < _REST * np.abs(v).max(), 0.0, np.sign(v))
+        columns = np.stack([x, a, v, moves, np.ones_like(x)], axis=1)
+        size = np.sqrt(np.mean(columns**2, axis=0))
+        scaled = columns / np.where(size > 0, size, 1.0)
+        theta = np.linalg.lstsq(scaled, q, rcond=1e-8)[0]
+        left = float(np.var(q - scaled @ theta)) / float(np.var(q))
+        if left < best.left and size[0] > 0:
+            best = Strokes(float(theta[0] / size[0]), left)
+    return best
 
 
 def implied_inertia(

@@ -432,12 +432,14 @@ def _of_command(unit: Unit | None, drive: int, frame: Frame, path: str) -> float
         return 1.0
     motion = frame.motion(frame.joint("force", drive))
     wrong = {"force": "rotary", "torque": "linear"}.get(unit.kind)
-    if wrong is not None and motion == wrong and frame.drive("torque_constant", drive) is None:
+    by_gain = wrong == "linear" and frame.drive("gain", drive) != 1.0  # of a screw or a rack
+    if motion == wrong and frame.drive("torque_constant", drive) is None and not by_gain:
         moves = "turns" if wrong == "rotary" else "slides"
         hint = "correct units, or motion in [plant]"
         if wrong == "linear":
-            hint = "leave units.force out, and state the force per N m as gain in [actuator]"
+            hint = "state the force for one N m as gain in [actuator]"
         raise InputError(f"the force is in {unit.text}, and joint {drive + 1} {moves}", where=path, hint=hint)
+
     if unit.kind != "percent":
         return unit.factor
     rated, supply = frame.drive("rated", drive), frame.drive("supply", drive)

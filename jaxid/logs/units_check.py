@@ -7,13 +7,13 @@ and remove noise.
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jaxid.logs.finding import Finding
 from jaxid.logs.log import Log
-from jaxid.logs.rough_inertia import correlation, implied_inertia, smooth, windows
+from jaxid.logs.rough_inertia import correlation, implied_inertia, ratio_of_strokes, smooth, windows
 
 # One number for all joints or channels, or one for each.
 ByJoint = float | int | Sequence[float | int] | np.ndarray
@@ -27,6 +27,8 @@ _MICRO = 500.0
 _NANO = 500_000.0
 # Chosen: two columns with a smaller correlation are not the same quantity in two units.
 _SIMILAR = 0.9
+# Chosen: a reference that is so many times the position, or so small a part of it, is not the position's.
+_ABSURD = 10.0
 
 
 # Units by their names in these messages.
@@ -171,20 +173,39 @@ def _compare_velocity(
 
 def _compare_reference(r: np.ndarray, q: np.ndarray, motion: str, where: str) -> list[Finding]:
     """Compare a reference with the position that follows it."""
-    if np.ptp(r) == 0 or abs(correlation(r, q)) < _SIMILAR:
+    similarity = correlation(r, q)
+    if np.ptp(r) == 0 or abs(similarity) < _SIMILAR:
         # The loop may be loose, or the reference constant: there is no basis for a verdict.
         return []
-    ratio = float(r.std() / q.std())
-    return _judge(ratio, _REFERENCE, motion, "the reference is {:.4g} times the position", where)
+    if similarity < 0:
+        what = "the reference has the opposite sign of the position"
+        hint = "if it is that of another direction, say sign = { reference = -1 } in [log]"
+        return [Finding("error", what, where, hint)]
+    way = abs(ratio_of_strokes(q, r).ratio)
+    ratio = 1.0 / way if way > 0 else float(r.std() / q.std())
+    findings = _judge(
+        ratio, _REFERENCE, motion, "the reference is {:.4g} times the position", where, spread=1.1
+    )
+    if not findings or findings[0].severity == "error":
+        return findings
+    unit = "m" if motion == "linear" else "rad"
+    hint = (
+        "check the units of both columns; if the encoder is a motor's in front of a gear, say "
+        f'units = {{ position = "{ratio:.4g} {unit}", reference = "{unit}" }} in [log]'
+    )
+    severity = "warning" if 1 / _ABSURD < ratio < _ABSURD else "error"
+    return [replace(findings[0], severity=severity, hint=hint)]
 
 
-def _judge(ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: str) -> list[Finding]:
-    """Report a ratio that is not one: an error if a common slip explains it, else a warning."""
+def _judge(
+    ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: str, *, spread: float = 1.2
+) -> list[Finding]:
+    """Report a ratio that is not one: an error if a common slip explains it within a spread."""
     if 0.67 < ratio < 1.5:
         return []
     finding = text.format(ratio)
     for slip in slips:
-        if slip.matches(ratio, motion, 1.2):
+        if slip.matches(ratio, motion, spread):
             hint = how_to_say(slip.text, "convert all columns to SI units")
             return [Finding("error", f"{finding}: {slip.text}", where, hint, "units")]
     hint = "check the units of both columns"

@@ -5,7 +5,7 @@ import pytest
 
 import jaxid
 from jaxid.first_case.columns import choose, columns_of
-from jaxid.first_case.two_encoders import ratio_of_strokes
+from jaxid.logs.rough_inertia import ratio_of_strokes
 from tests.estimators.test_reading_noise import SOFT, deviations
 from truth.chain.flexible_joints import flexible_joint
 
@@ -76,7 +76,7 @@ def test_a_missing_reading_of_the_load_is_resampled(log):
     assert case.tables["log"]["resample"] == pytest.approx(1000.0)
 
 
-def test_a_reference_of_the_load_is_left_out_behind_a_gear(log):
+def test_a_reference_of_the_load_is_brought_to_the_motor_in_front_of_a_gear(log):
     table = {
         "t": log["t"],
         "motor pos [deg]": np.rad2deg(50 * log["q_motor"]),
@@ -84,9 +84,40 @@ def test_a_reference_of_the_load_is_left_out_behind_a_gear(log):
         "pos ref [deg]": np.rad2deg(log["q_load"]),
         "torque [Nm]": log["torque"] / 50,
     }
-    tables = jaxid.init(table).tables["log"]
-    assert "reference" not in tables
-    assert tables["units"] == {"position": "deg", "load_position": "deg", "force": "Nm"}
+    case = jaxid.init(table)
+    units = {"position": "deg", "load_position": "deg", "force": "Nm", "reference": "50 deg"}
+    assert case.tables["log"]["units"] == units
+    read = jaxid.open_session(case.case(), table).fits[0].log
+    assert read.reference is not None
+    assert np.allclose(read.reference[:, 0], log["q_load"])
+
+
+def test_the_encoder_of_a_load_that_counts_backwards_has_its_sign_turned(log):
+    table = {"t": log["t"], "q_motor": log["q_motor"], "q_load": -log["q_load"], "torque": log["torque"]}
+    case = jaxid.init(table)
+    assert case.tables["log"]["sign"] == {"load_position": -1}
+    assert case.tables["plant"]["kind"] == "flexible_axis"
+    assert any("count in opposite directions" in line for line in case.questions)
+
+
+@pytest.mark.parametrize("load", ["table position [mm]", "y [mm]"])
+def test_an_angle_and_a_length_are_motor_and_load_of_a_screw(log, load):
+    lead = 0.005
+    table = {
+        "t": log["t"],
+        "angle [deg]": np.rad2deg(log["q_motor"] * 2 * np.pi / lead),
+        load: 1e3 * log["q_load"],
+        "torque [Nm]": log["torque"] * lead / (2 * np.pi),
+    }
+    case = jaxid.init(table)
+    assert case.tables["plant"]["motion"] == "linear"
+    drive = case.tables["actuator"]
+    assert drive["lead"] == lead
+    assert drive["gain"] == pytest.approx(2 * np.pi / lead, rel=1e-5)
+    assert case.tables["log"]["position_at"] == "motor"
+    read = jaxid.open_session(case.case(), table).fits[0].log
+    assert np.allclose(read.position, np.stack([log["q_motor"], log["q_load"]], axis=1))
+    assert np.allclose(read.force[:, 0] * drive["gain"], log["torque"], rtol=1e-5)
 
 
 def test_joints_of_a_robots_file_are_no_motor_and_load(log):
@@ -130,7 +161,7 @@ def test_a_gear_between_two_encoders_is_found_exactly(log):
 def test_the_resonance_does_not_move_the_ratio(log):
     """A regression of the two positions alone is half a percent off where the load swings further."""
     motor, load = log["q_motor"], log["q_load"]
-    assert ratio_of_strokes(80.0 * motor, load) == pytest.approx(80.0, rel=2e-4)
+    assert ratio_of_strokes(80.0 * motor, load).ratio == pytest.approx(80.0, rel=2e-4)
 
 
 def test_counts_of_two_encoders_ask_for_their_size(log):

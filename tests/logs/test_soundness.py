@@ -176,6 +176,17 @@ def test_reference_by_an_unusual_factor_is_a_warning():
     found(scaled(axis_log(), reference=5.0), "warning", "which should be 1")
 
 
+def test_a_reference_behind_a_gear_says_how_the_position_is_brought_to_it():
+    """A ratio of 50 is not that of degrees to radians, 57.3."""
+    finding = found(scaled(axis_log(), reference=0.02), "error", "which should be 1", motion="rotary")
+    assert 'units = { position = "0.02 rad", reference = "rad" }' in finding.hint
+
+
+def test_a_reference_of_the_opposite_sign_is_refused():
+    finding = found(scaled(axis_log(), reference=-1.0), "error", "opposite sign of the position")
+    assert "sign = { reference = -1 }" in finding.hint
+
+
 def test_magnitudes():
     bare = axis_log(velocity=None, reference=None)
     found(scaled(bare, position=1e3), "warning", "position looks like millimetres")

@@ -1,0 +1,183 @@
+"""Units of a position that does not move as far as its reference: in front of a gear, or in counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from jaxid.first_case.columns import Chosen
+from jaxid.first_case.section import rounded
+from jaxid.first_case.units import SI, Measures
+from jaxid.logs.rough_inertia import ratio_of_strokes
+from jaxid.logs.units import fits, parse_unit
+
+# Part of the variance of a position that its reference may leave unexplained.
+_FOLLOWED = 0.05
+# Ratio of two ways that counts as one: a loop with a weight or low gains does not reach its reference.
+_SAME = 1.5
+# Within so much of a whole number a ratio is that. Dry friction moves a ratio by some 1 %: so near to a power
+# of two are the counts of a turn, and twice that near to the ratio of two units are these.
+_WHOLE, _POWER, _NEAR = 5e-4, 0.01, 0.02
+_DEGREES = 180.0 / np.pi
+# Units of position and reference by the ratio of their ways, where no column states one.
+_PAIRS = {
+    "rotary": (
+        (_DEGREES, "deg", "rad"),
+        (1 / _DEGREES, "rad", "deg"),
+        (2 * np.pi, "rad", "rev"),
+        (1 / (2 * np.pi), "rev", "rad"),
+        (360.0, "deg", "rev"),
+        (1 / 360.0, "rev", "deg"),
+    ),
+    "linear": ((1e3, "mm", "m"), (1e-3, "m", "mm"), (1e6, "um", "m"), (1e-6, "m", "um")),
+}
+
+
+@dataclass
+class _Changes:
+    """Changes of the units of a log, with the lines that say them.
+
+    Attributes:
+        units: New units, by quantity.
+        said, questions: See `Measures`.
+        counts: Counts of a turn; None: positions are not brought from counts to an angle.
+        sign: Signs that are turned, by quantity.
+    """
+
+    units: dict[str, str] = field(default_factory=dict)
+    said: list[str] = field(default_factory=list)
+    questions: dict[str, str] = field(default_factory=dict)
+    counts: int | None = None
+    sign: dict[str, int] = field(default_factory=dict)
+
+
+def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
+    """Return the units of a joint, changed where its position moves otherwise than its reference.
+
+    Without a force the position is brought to the joint, where the reference is. Beside a force the reference
+    is brought to the position.
+
+    Args:
+        chosen: The columns.
+        measures: Their units, as names and values show.
+    """
+    counted = "position" in measures.labels
+    if len(chosen.position) != 1 or len(chosen.reference) != 1 or (counted and chosen.force):
+        return measures
+    if measures.counts is not None or measures.unwrap or _of_other_kinds(measures):
+        return measures
+    strokes = ratio_of_strokes(chosen.position[0].values, chosen.reference[0].values)
+    size = 1.0 if counted else _size(measures.units.get("position", ""))
+    ratio = strokes.ratio * size / _size(_unit_of_reference(chosen, measures))
+    if strokes.left > _FOLLOWED or 1 / _SAME < ratio < _SAME:
+        return measures
+
+    changes = _Changes()
+    if ratio < 0:
+        _turned(chosen, changes)
+    if not 1 / _SAME < abs(ratio) < _SAME:
+        if counted:
+            _of_counts(chosen, measures, abs(ratio), changes)
+        elif (units := _of_two_units(chosen, measures, abs(ratio))) is not None:
+            _of_units(chosen, units, changes)
+        else:
+            _of_gear(chosen, measures, abs(ratio), changes)
+    labels = {q: label for q, label in measures.labels.items() if q not in changes.units}
+    said = [line for line in measures.said if not (counted and changes.units and "encoder counts" in line)]
+    return replace(
+        measures,
+        units={**measures.units, **changes.units},
+        labels=labels,
+        said=(*said, *changes.said),
+        questions={**measures.questions, **changes.questions},
+        counts=changes.counts,
+        sign={**measures.sign, **changes.sign},
+    )
+
+
+def _of_other_kinds(measures: Measures) -> bool:
+    """Check whether one of position and reference is an angle and the other one a length."""
+    units = [parse_unit(measures.units.get(quantity, "")) for quantity in ("position", "reference")]
+    return {"angle", "length"} == {unit.kind for unit in units if unit is not None}
+
+
+def _size(unit: str) -> float:
+    """Return a unit in SI units; 1 if there is none."""
+    found = parse_unit(unit)
+    return 1.0 if found is None else found.factor
+
+
+def _unit_of_reference(chosen: Chosen, measures: Measures) -> str:
+    """Return the unit of the reference; that in SI units if nothing states it."""
+    own = chosen.reference[0].unit
+    stated = own if fits(parse_unit(own), "position") else ""
+    return measures.units.get("reference", "") or stated or SI[measures.motion]
+
+
+def _turned(chosen: Chosen, changes: _Changes) -> None:
+    """Turn the sign of a reference against which the position moves."""
+    position, reference = chosen.position[0].name, chosen.reference[0].name
+    changes.sign["reference"] = -1
+    changes.said.append(f"'{position}' moves against '{reference}': the sign of the reference is turned")
+    changes.questions["sign"] = f"do '{position}' and '{reference}' count in opposite directions?"
+
+
+def _of_counts(chosen: Chosen, measures: Measures, ratio: float, changes: _Changes) -> None:
+    """Bring counts of an encoder to the unit of the reference."""
+    reference, si = chosen.reference[0].name, SI[measures.motion]
+    changes.said.append(f"positions are encoder counts, {ratio:.5g} for one {si} of '{reference}'")
+    if measures.motion == "linear":
+        changes.units["position"] = f"{rounded(1 / ratio, 5):g} m"
+        changes.questions["position"] = "is this the size of a count?"
+    else:
+        turn = 2 * np.pi * ratio
+        power = 2.0 ** round(np.log2(turn))
+        changes.counts = round(power if abs(turn / power - 1) < _POWER else turn)
+        changes.units["position"] = "count"
+        changes.questions["position"] = (
+            f"is a turn of the joint {changes.counts} counts? Else counts_per_revolution"
+        )
+    # Without a unit it would have that of the position.
+    changes.units["reference"] = _unit_of_reference(chosen, measures)
+
+
+def _of_two_units(chosen: Chosen, measures: Measures, ratio: float) -> tuple[str, str] | None:
+    """Return the units of position and reference that have this ratio, if no column states one."""
+    if chosen.position[0].unit or chosen.reference[0].unit or "position" in measures.units:
+        return None
+    pairs = _PAIRS[measures.motion]
+    return next(((of, to) for size, of, to in pairs if abs(ratio / size - 1) < _NEAR), None)
+
+
+def _of_units(chosen: Chosen, units: tuple[str, str], changes: _Changes) -> None:
+    """State two units of which the ratio is that of the ways."""
+    changes.units |= dict(zip(("position", "reference"), units, strict=True))
+    changes.said.append(
+        f"'{chosen.position[0].name}' is in {units[0]} and '{chosen.reference[0].name}' in {units[1]}, "
+        "by the ratio of their ways"
+    )
+    changes.questions["position"] = f"is the position in {units[0]}, and the reference in {units[1]}?"
+
+
+def _of_gear(chosen: Chosen, measures: Measures, ratio: float, changes: _Changes) -> None:
+    """Bring position and reference to one place where a gear is between them."""
+    position, reference = chosen.position[0].name, chosen.reference[0].name
+    si, whole = SI[measures.motion], round(ratio)
+    ratio = float(whole) if whole and abs(ratio / whole - 1) < _WHOLE else rounded(ratio, 5)
+    changes.said.append(
+        f"'{position}' moves about {ratio:.4g} times as far as '{reference}', as a motor before a gear"
+    )
+    changes.questions["position"] = (
+        f"is {ratio:g} the ratio of the gear between '{position}' and '{reference}'? Or are their units not "
+        "those in [log]?"
+    )
+    if chosen.force:
+        changes.units["reference"] = f"{ratio:g} {_unit_of_reference(chosen, measures)}"
+        return
+    size = rounded(1 / ratio, 6)
+    changes.units["position"] = f"{size:g} {measures.units.get('position', si)}"
+    if chosen.velocity:
+        changes.units["velocity"] = f"{size:g} {measures.units.get('velocity', f'{si}/s')}"
+    # Without a unit it would have that of the position.
+    changes.units["reference"] = _unit_of_reference(chosen, measures)
