@@ -146,6 +146,8 @@ UNIT_OF = (
     "load_acceleration",
 )
 SIGN_OF = UNIT_OF[1:]
+# Quantities whose zero may be moved.
+OFFSET_OF = ("position", "reference", "load_position")
 # Quantities of a log that may have been logged late.
 LATE_OF = ("force",)
 # Sides of a gear at which an angle may be measured.

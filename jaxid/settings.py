@@ -23,6 +23,7 @@ from jaxid.names import (
     LOG_KINDS,
     METHODS,
     MINIMISERS,
+    OFFSET_OF,
     OUTPUTS,
     RESAMPLINGS,
     SEPARATORS,
@@ -126,6 +127,12 @@ class LogTable:
     )
     sign: Mapping[str, float | tuple[float, ...]] | None = key(
         by_quantity(sign, SIGN_OF), "1 or -1 for a quantity, or a list by column: it is multiplied", note="1"
+    )
+    offset: Mapping[str, float | tuple[float, ...]] | None = key(
+        by_quantity(number(), OFFSET_OF),
+        "added to a quantity after its conversion, or a list by column: moves its zero",
+        unit="position",
+        note="0",
     )
     delay: Mapping[str, float | tuple[float, ...]] | None = key(
         by_quantity(number("positive"), LATE_OF),

@@ -32,6 +32,8 @@ _GRAVITY = 9.81
 _MOMENT = 0.1
 # Smallest guesses over the size of the force: friction is positive.
 _LEAST = 0.01
+# Keys of [log] that are tables by quantity, and not by joint.
+_BY_QUANTITY = ("units", "sign", "offset")
 # Noise beyond that of the rounding, as a variance over it, from which it is stated.
 _BEYOND_ROUNDING = 1.5
 
@@ -201,11 +203,16 @@ class Draft:
             keys = {"kind": kind, key: {"guess": rounded(value)}}
             return Section("[[effects]]", keys, {key: units.label(dimension)})
 
+        # The distance from the reference is known to some per cent of the way.
+        constant = []
+        if self._measures.offset:
+            constant = [effect("constant_force", "level", 0.01 * inertia * rate**2 * stroke, "force")]
         return [
             plant,
             values,
             effect("viscous_friction", "coefficient", 0.3 * inertia * rate, "force*time/position"),
             effect("coulomb_friction", "level", 0.01 * inertia * rate**2 * stroke, "force"),
+            *constant,
             loop_of_servos([inertia], log.period),
             table,
             *self._sensor(log),
@@ -241,6 +248,8 @@ class Draft:
             del section.keys["units"]
         if measures.sign:
             section.keys["sign"] = dict(measures.sign)
+        if measures.offset:
+            section.keys["offset"] = dict(measures.offset)
         if measures.unwrap:
             section.keys["unwrap"] = measures.unwrap
         if measures.counts is not None:
@@ -400,7 +409,7 @@ class Draft:
     def _read(self, table: Section, drive: Section | None = None) -> Log:
         """Read the log as the case will, with the ratio of a gear if there is one."""
         columns = {
-            key: list(value.values()) if isinstance(value, dict) and key not in ("units", "sign") else value
+            key: list(value.values()) if isinstance(value, dict) and key not in _BY_QUANTITY else value
             for key, value in table.keys.items()
         }
         driven = self.driven

@@ -1,4 +1,4 @@
-"""Units of a position that does not move as far as its reference: in front of a gear, or in counts."""
+"""Units and zero of a position that is not that of its reference: in front of a gear, or in counts."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import numpy as np
 from jaxid.first_case.columns import Chosen
 from jaxid.first_case.section import rounded
 from jaxid.first_case.units import SI, Measures
-from jaxid.logs.rough_inertia import ratio_of_strokes
+from jaxid.logs.rough_inertia import Strokes, ratio_of_strokes
 from jaxid.logs.units import fits, parse_unit
 
 # Part of the variance of a position that its reference may leave unexplained.
 _FOLLOWED = 0.05
 # Ratio of two ways that counts as one: a loop with a weight or low gains does not reach its reference.
 _SAME = 1.5
+# Part of the way of a reference from which its distance from the position counts as one of two zeros.
+_APART = 0.05
 # Within so much of a whole number a ratio is that. Dry friction moves a ratio by some 1 %: so near to a power
 # of two are the counts of a turn, and twice that near to the ratio of two units are these.
 _WHOLE, _POWER, _NEAR = 5e-4, 0.01, 0.02
@@ -42,7 +44,7 @@ class _Changes:
         units: New units, by quantity.
         said, questions: See `Measures`.
         counts: Counts of a turn; None: positions are not brought from counts to an angle.
-        sign: Signs that are turned, by quantity.
+        sign, offset: Signs that are turned and zeros that are moved, by quantity.
     """
 
     units: dict[str, str] = field(default_factory=dict)
@@ -50,6 +52,7 @@ class _Changes:
     questions: dict[str, str] = field(default_factory=dict)
     counts: int | None = None
     sign: dict[str, int] = field(default_factory=dict)
+    offset: dict[str, float] = field(default_factory=dict)
 
 
 def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
@@ -68,12 +71,12 @@ def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
     if measures.counts is not None or measures.unwrap or _of_other_kinds(measures):
         return measures
     strokes = ratio_of_strokes(chosen.position[0].values, chosen.reference[0].values)
-    size = 1.0 if counted else _size(measures.units.get("position", ""))
-    ratio = strokes.ratio * size / _size(_unit_of_reference(chosen, measures))
-    if strokes.left > _FOLLOWED or 1 / _SAME < ratio < _SAME:
+    if strokes.left > _FOLLOWED or strokes.ratio == 0:
         return measures
 
     changes = _Changes()
+    size = 1.0 if counted else _size(measures.units.get("position", ""))
+    ratio = strokes.ratio * size / _size(_unit_of_reference(chosen, measures))
     if ratio < 0:
         _turned(chosen, changes)
     if not 1 / _SAME < abs(ratio) < _SAME:
@@ -84,6 +87,8 @@ def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
         else:
             _of_gear(chosen, measures, abs(ratio), changes)
     labels = {q: label for q, label in measures.labels.items() if q not in changes.units}
+    if not chosen.force and "position" not in labels:
+        _of_zero(chosen, measures, strokes, changes)
     said = [line for line in measures.said if not (counted and changes.units and "encoder counts" in line)]
     return replace(
         measures,
@@ -92,7 +97,8 @@ def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
         said=(*said, *changes.said),
         questions={**measures.questions, **changes.questions},
         counts=changes.counts,
-        sign={**measures.sign, **changes.sign},
+        sign=changes.sign,
+        offset=changes.offset,
     )
 
 
@@ -181,3 +187,28 @@ def _of_gear(chosen: Chosen, measures: Measures, ratio: float, changes: _Changes
         changes.units["velocity"] = f"{size:g} {measures.units.get('velocity', f'{si}/s')}"
     # Without a unit it would have that of the position.
     changes.units["reference"] = _unit_of_reference(chosen, measures)
+
+
+def _of_zero(chosen: Chosen, measures: Measures, strokes: Strokes, changes: _Changes) -> None:
+    """Move the zero of a reference that its position follows at a distance."""
+    position, reference = chosen.position[0], chosen.reference[0]
+    units = {**measures.units, **changes.units}
+    of_position = _size(units.get("position", ""))
+    if changes.counts is not None:
+        of_position = 2 * np.pi / changes.counts
+    wanted = reference.values * _size(units.get("reference") or _unit_of_reference(chosen, measures))
+    wanted = wanted * changes.sign.get("reference", 1)
+    # The fit at the mean of the reference, where an error of the ratio does not count.
+    mean = (strokes.ratio * float(reference.values.mean()) + strokes.offset) * of_position
+    offset = mean - float(wanted.mean())
+    if abs(offset) < _APART * float(np.ptp(wanted)):
+        return
+    si = SI[measures.motion]
+    changes.offset["reference"] = rounded(offset, 6)
+    changes.said.append(
+        f"'{position.name}' lies {offset:.4g} {si} from '{reference.name}', whose zero is moved"
+    )
+    changes.questions["offset"] = (
+        f"do '{position.name}' and '{reference.name}' count from different zeros? Else a constant load holds "
+        "the joint away, and offset is to be left out"
+    )

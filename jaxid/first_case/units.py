@@ -55,7 +55,7 @@ class Measures:
         labels: `[plant] units`, by quantity, where a quantity is not mechanical.
         unwrap: `[log] unwrap`; False: positions go on.
         counts: `[log] counts_per_revolution`; None: not known, or positions are in another unit.
-        sign: `[log] sign`, by quantity.
+        sign, offset: `[log] sign` and `[log] offset`, by quantity.
         said: Lines on everything that was assumed.
         questions: Doubts, by quantity.
     """
@@ -68,6 +68,7 @@ class Measures:
     questions: dict[str, str]
     counts: int | None = None
     sign: Mapping[str, int] = field(default_factory=dict)
+    offset: Mapping[str, float] = field(default_factory=dict)
 
 
 def measures_of(chosen: Chosen, robot: str = "") -> Measures:

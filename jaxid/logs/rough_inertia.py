@@ -59,10 +59,12 @@ class Strokes(NamedTuple):
 
     Args:
         ratio: Way of the first over that of the second; negative if they move against each other.
+        offset: The first where the second is zero, of positions at rest.
         left: Part of the variance of the first that its fit leaves.
     """
 
     ratio: float
+    offset: float
     left: float
 
 
@@ -75,7 +77,7 @@ def ratio_of_strokes(first: Signal, second: Signal) -> Strokes:
     Args:
         first, second: Two positions of one length.
     """
-    best = Strokes(0.0, np.inf)
+    best = Strokes(0.0, 0.0, np.inf)
     for window in windows(second.size - 2):
         signals = (
             first[1:-1],
@@ -93,7 +95,7 @@ def ratio_of_strokes(first: Signal, second: Signal) -> Strokes:
         theta = np.linalg.lstsq(scaled, q, rcond=1e-8)[0]
         left = float(np.var(q - scaled @ theta)) / float(np.var(q))
         if left < best.left and size[0] > 0:
-            best = Strokes(float(theta[0] / size[0]), left)
+            best = Strokes(float(theta[0] / size[0]), float(theta[-1]), left)
     return best
 
 

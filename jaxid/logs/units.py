@@ -240,7 +240,7 @@ def converted(
     frame: Frame,
     path: str,
 ) -> tuple[dict[str, np.ndarray], list[Assumed]]:
-    """Convert the columns of a log to SI units, and turn the signs that the case states.
+    """Convert the columns of a log to SI units, turn the signs and move the zeros that the case states.
 
     Args:
         groups: Columns by quantity, (samples, width).
@@ -257,8 +257,8 @@ def converted(
         InputError: If a unit does not go with the machine, or a statement converts nothing.
     """
     stated = dict(table.units or {})
-    signs = dict(table.sign or {})
-    for key, given in (("units", stated), ("sign", signs)):
+    signs, offsets = dict(table.sign or {}), dict(table.offset or {})
+    for key, given in (("units", stated), ("sign", signs), ("offset", offsets)):
         for quantity in given:
             if quantity not in groups:
                 hint = f"add the column, or leave out {key}.{quantity}"
@@ -273,6 +273,8 @@ def converted(
         factors = [_factor(u, quantity, k, table, frame, path) for k, u in enumerate(units)]
         factors = np.array(factors) * np.broadcast_to(np.asarray(signs.get(quantity, 1.0)), values.shape[1])
         out[quantity] = values if np.all(factors == 1.0) else values * factors
+        if quantity in offsets:
+            out[quantity] = out[quantity] + np.broadcast_to(np.asarray(offsets[quantity]), values.shape[1])
         assumed += said
     return out, assumed
 

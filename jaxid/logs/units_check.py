@@ -29,6 +29,8 @@ _NANO = 500_000.0
 _SIMILAR = 0.9
 # Chosen: a reference that is so many times the position, or so small a part of it, is not the position's.
 _ABSURD = 10.0
+# Chosen: a position so many strokes away from its reference has another zero, or hangs on a load.
+_FAR_APART = 0.5
 
 
 # Units by their names in these messages.
@@ -186,7 +188,9 @@ def _compare_reference(r: np.ndarray, q: np.ndarray, motion: str, where: str) ->
     findings = _judge(
         ratio, _REFERENCE, motion, "the reference is {:.4g} times the position", where, spread=1.1
     )
-    if not findings or findings[0].severity == "error":
+    if not findings:
+        return _compare_zero(float(np.mean(q) - np.mean(r)), float(np.ptp(r)), where)
+    if findings[0].severity == "error":
         return findings
     unit = "m" if motion == "linear" else "rad"
     hint = (
@@ -195,6 +199,18 @@ def _compare_reference(r: np.ndarray, q: np.ndarray, motion: str, where: str) ->
     )
     severity = "warning" if 1 / _ABSURD < ratio < _ABSURD else "error"
     return [replace(findings[0], severity=severity, hint=hint)]
+
+
+def _compare_zero(apart: float, stroke: float, where: str) -> list[Finding]:
+    """Report a reference that the position follows far away from it."""
+    if abs(apart) < _FAR_APART * stroke:
+        return []
+    what = f"the position lies {apart:.4g} from the reference that it follows"
+    hint = (
+        f"if the two count from different zeros, say offset = {{ reference = {apart:.4g} }} in [log]; else a "
+        "constant load holds the joint away"
+    )
+    return [Finding("warning", what, where, hint)]
 
 
 def _judge(

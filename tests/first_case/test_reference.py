@@ -101,3 +101,21 @@ def test_a_column_that_is_not_followed_says_nothing_of_units():
     other = np.random.default_rng(0).standard_normal(T.size).cumsum()
     case = jaxid.init({"t": T, "command": 100.0 * other, "position": followed(moves())})
     assert "units" not in case.tables["log"]
+
+
+@pytest.mark.parametrize(("ratio", "sign"), [(1.0, 1), (50.0, 1), (1.0, -1)])
+def test_a_position_with_another_zero_than_its_command_moves_the_zero_of_this(ratio, sign):
+    joint = followed(moves())
+    table = {"t": T, "command": sign * moves() + 0.2, "position": ratio * (joint + 0.7)}
+    case = jaxid.init(table)
+    assert "constant_force" in [effect["kind"] for effect in case.tables["effects"]]
+    assert any("different zeros" in line for line in case.questions)
+    read = jaxid.open_session(case.case(), table).fits[0].log
+    assert read.reference is not None
+    off = float(np.mean(read.reference - read.position))
+    assert abs(off) < 0.01 * np.ptp(joint)
+
+
+def test_beside_a_force_no_zero_is_moved():
+    table = {"t": T, "command": moves() + 0.7, "position": followed(moves()), "torque": np.sin(T)}
+    assert "offset" not in jaxid.init(table).tables["log"]

@@ -187,6 +187,14 @@ def test_a_reference_of_the_opposite_sign_is_refused():
     assert "sign = { reference = -1 }" in finding.hint
 
 
+def test_a_reference_with_another_zero_is_a_warning():
+    log = axis_log()
+    far = dataclasses.replace(log, position=log.position + 2.0 * np.ptp(log.position), velocity=None)
+    assert "offset = { reference = " in found(far, "warning", "from the reference that it follows").hint
+    near = dataclasses.replace(log, position=log.position + 0.1 * np.ptp(log.position), velocity=None)
+    assert check_log(near) == []
+
+
 def test_magnitudes():
     bare = axis_log(velocity=None, reference=None)
     found(scaled(bare, position=1e3), "warning", "position looks like millimetres")

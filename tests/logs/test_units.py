@@ -124,6 +124,14 @@ def test_a_current_in_milliamperes_is_not_taken_for_amperes():
     assert "goes with a current" in assumed_of({"force": "u_A"}, torque_constant=0.05)[0]
 
 
+def test_an_offset_is_added_to_converted_values():
+    log = as_log(
+        DATA, {**COLUMNS, "units": {"position": "deg"}, "sign": {"position": -1}, "offset": {"position": 0.5}}
+    )
+    plain = as_log(DATA, COLUMNS)
+    assert np.allclose(log.position, 0.5 - np.deg2rad(plain.position))
+
+
 def test_signs_are_turned_by_column():
     log = as_log(DATA, {**COLUMNS, "sign": {"force": -1}})
     np.testing.assert_array_equal(log.force[:, 0], -U)
@@ -151,6 +159,8 @@ def test_a_reference_has_the_unit_of_the_position_and_that_is_said():
         ({"units": {"position": "count"}}, ROTARY, "counts of no known size; state counts_per_revolution"),
         ({"units": {"velocity": "rpm"}}, ROTARY, "units.velocity converts nothing"),
         ({"sign": {"reference": -1}}, ROTARY, "sign.reference converts nothing"),
+        ({"offset": {"reference": 1.0}}, ROTARY, "offset.reference converts nothing"),
+        ({"offset": {"force": 1.0}}, ROTARY, "force"),
         ({"sign": {"force": 2}}, ROTARY, "sign.force = 2 is no sign; give 1 or -1"),
         ({"units": {"force": "N"}}, ROTARY, "the force is in N, and joint 1 turns"),
         ({"units": {"force": "N m"}}, LINEAR, "the force is in N m, and joint 1 slides"),
