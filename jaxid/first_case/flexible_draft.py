@@ -11,6 +11,7 @@ from jaxid.first_case.columns import Column
 from jaxid.first_case.drafting import Draft, driven_balance, positive_friction
 from jaxid.first_case.section import Section, rounded
 from jaxid.first_case.two_encoders import by_screw
+from jaxid.first_case.units import kind_of_force
 from jaxid.logs.rough_inertia import ratio_of_strokes
 
 # Resonance of a coupling [Hz] and its damping ratio that nothing states.
@@ -58,8 +59,10 @@ class FlexibleDraft(Draft):
         half, omega = 0.5 * rough.inertia, 2 * np.pi * _RESONANCE
         stiffness = omega**2 * 0.5 * half
         plant = Section("[plant]", {"kind": "flexible_axis", "motion": self._measures.motion})
+        screw = by_screw(chosen.position[0], self._load)
+        why = "is a length beside an angle" if screw else "names the load"
         plant.assumed.append(
-            f"'{self._load.name}' has the course of '{chosen.position[0].name}' and names the load: it is "
+            f"'{self._load.name}' has the course of '{chosen.position[0].name}' and {why}: it is "
             "the load's encoder, behind a coupling that gives"
         )
         self._label(plant)
@@ -128,7 +131,8 @@ class FlexibleDraft(Draft):
         lead = 1e-3 * _near_whole(1e3 * 2 * np.pi / slope)
         drive = Section("[actuator]", {"gear_ratio": 1.0, "lead": rounded(lead, 6)}, {"lead": "m/rev"})
         drive.assumed.append(f"the load moves {1e3 * 2 * np.pi / slope:.6g} mm in a turn of the motor")
-        drive.questions.append("is this the lead of the screw, or the way of rack or belt in a turn?")
+        drive.questions.append("is this the lead of the screw, or the travel of rack or belt in a turn?")
+        drive.questions.append("are the two positions those of one drive, and not of two joints?")
         self._of_motor(drive, 2 * np.pi / lead, table)
         return drive
 
@@ -137,14 +141,19 @@ class FlexibleDraft(Draft):
         [motor], reference = self._chosen.position, self._chosen.reference
         table.keys["position_at"] = "motor"
         labelled = "force" in self._measures.labels
-        drive.keys["gain"] = 1.0 if labelled else rounded(ratio, 6)
-        if not labelled:
+        at_load = by_screw(motor, self._load) and kind_of_force(self._chosen.force[0]) == "force"
+        drive.keys["gain"] = 1.0 if labelled or at_load else rounded(ratio, 6)
+        if not labelled and not at_load:
             drive.questions.append(
                 "is the force that of the motor? If it is that behind the gear, gain = 1.0"
             )
         if reference and not by_screw(motor, reference[0]) and self._of_load_side(reference[0], motor, ratio):
             del table.keys["reference"]
-            table.keys.get("units", {}).pop("reference", None)
+            for key in ("units", "sign"):
+                stated = table.keys.get(key, {})
+                stated.pop("reference", None)
+                if not stated:
+                    table.keys.pop(key, None)
             table.offers.clear()
             table.assumed.append(f"'{reference[0].name}' is not used: it moves as far as the load")
 

@@ -9,20 +9,20 @@ import numpy as np
 from jaxid.first_case.columns import Chosen
 from jaxid.first_case.section import rounded
 from jaxid.first_case.units import SI, Measures
-from jaxid.logs.rough_inertia import Strokes, ratio_of_strokes
+from jaxid.logs.rough_inertia import Strokes, correlation, ratio_of_strokes
 from jaxid.logs.units import fits, parse_unit
 
-# Part of the variance of a position that its reference may leave unexplained.
-_FOLLOWED = 0.05
-# Ratio of two ways that counts as one: a loop with a weight or low gains does not reach its reference.
+# Correlation from which a position follows its reference, and the part of its variance that may be left.
+_ALIKE, _FOLLOWED = 0.9, 0.05
+# Ratio of two strokes that counts as one: a loop with a weight or low gains does not reach its reference.
 _SAME = 1.5
-# Part of the way of a reference from which its distance from the position counts as one of two zeros.
+# Part of the stroke of a reference from which its distance from the position counts as one of two zeros.
 _APART = 0.05
 # Within so much of a whole number a ratio is that. Dry friction moves a ratio by some 1 %: so near to a power
 # of two are the counts of a turn, and twice that near to the ratio of two units are these.
 _WHOLE, _POWER, _NEAR = 5e-4, 0.01, 0.02
 _DEGREES = 180.0 / np.pi
-# Units of position and reference by the ratio of their ways, where no column states one.
+# Units of position and reference by the ratio of their strokes, where no column states one.
 _PAIRS = {
     "rotary": (
         (_DEGREES, "deg", "rad"),
@@ -41,18 +41,39 @@ class _Changes:
     """Changes of the units of a log, with the lines that say them.
 
     Attributes:
+        motion: "linear" or "rotary".
         units: New units, by quantity.
-        said, questions: See `Measures`.
+        said, questions: New lines, see `Measures`.
+        settled: Beginnings of older lines, and quantities of older questions, that no longer hold.
         counts: Counts of a turn; None: positions are not brought from counts to an angle.
         sign, offset: Signs that are turned and zeros that are moved, by quantity.
     """
 
+    motion: str
     units: dict[str, str] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
     questions: dict[str, str] = field(default_factory=dict)
+    settled: list[str] = field(default_factory=list)
     counts: int | None = None
     sign: dict[str, int] = field(default_factory=dict)
     offset: dict[str, float] = field(default_factory=dict)
+
+    def on(self, measures: Measures) -> Measures:
+        """Return measures with these changes."""
+        old = tuple(self.settled)
+        said = [line for line in measures.said if not old or not line.startswith(old)]
+        questions = {q: text for q, text in measures.questions.items() if q not in self.settled}
+        return replace(
+            measures,
+            motion=self.motion,
+            units={**measures.units, **self.units},
+            labels={q: label for q, label in measures.labels.items() if q not in self.units},
+            said=(*said, *self.said),
+            questions={**questions, **self.questions},
+            counts=self.counts,
+            sign=self.sign,
+            offset=self.offset,
+        )
 
 
 def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
@@ -70,11 +91,12 @@ def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
         return measures
     if measures.counts is not None or measures.unwrap or _of_other_kinds(measures):
         return measures
-    strokes = ratio_of_strokes(chosen.position[0].values, chosen.reference[0].values)
-    if strokes.left > _FOLLOWED or strokes.ratio == 0:
+    position, reference = chosen.position[0].values, chosen.reference[0].values
+    alike, strokes = correlation(position, reference), ratio_of_strokes(position, reference)
+    if abs(alike) < _ALIKE or strokes.left > _FOLLOWED or strokes.ratio * alike <= 0:
         return measures
 
-    changes = _Changes()
+    changes = _Changes(measures.motion)
     size = 1.0 if counted else _size(measures.units.get("position", ""))
     ratio = strokes.ratio * size / _size(_unit_of_reference(chosen, measures))
     if ratio < 0:
@@ -82,24 +104,11 @@ def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
     if not 1 / _SAME < abs(ratio) < _SAME:
         if counted:
             _of_counts(chosen, measures, abs(ratio), changes)
-        elif (units := _of_two_units(chosen, measures, abs(ratio))) is not None:
-            _of_units(chosen, units, changes)
-        else:
+        elif not _of_two_units(chosen, measures, abs(ratio), changes):
             _of_gear(chosen, measures, abs(ratio), changes)
-    labels = {q: label for q, label in measures.labels.items() if q not in changes.units}
-    if not chosen.force and "position" not in labels:
+    if not chosen.force and ("position" in changes.units or not counted):
         _of_zero(chosen, measures, strokes, changes)
-    said = [line for line in measures.said if not (counted and changes.units and "encoder counts" in line)]
-    return replace(
-        measures,
-        units={**measures.units, **changes.units},
-        labels=labels,
-        said=(*said, *changes.said),
-        questions={**measures.questions, **changes.questions},
-        counts=changes.counts,
-        sign=changes.sign,
-        offset=changes.offset,
-    )
+    return changes.on(measures)
 
 
 def _of_other_kinds(measures: Measures) -> bool:
@@ -131,9 +140,13 @@ def _turned(chosen: Chosen, changes: _Changes) -> None:
 
 def _of_counts(chosen: Chosen, measures: Measures, ratio: float, changes: _Changes) -> None:
     """Bring counts of an encoder to the unit of the reference."""
-    reference, si = chosen.reference[0].name, SI[measures.motion]
+    reference, wanted = chosen.reference[0].name, _unit_of_reference(chosen, measures)
+    unit = parse_unit(wanted)
+    changes.motion = "linear" if unit is not None and unit.kind == "length" else "rotary"
+    si = SI[changes.motion]
+    changes.settled.append("positions are whole numbers")
     changes.said.append(f"positions are encoder counts, {ratio:.5g} for one {si} of '{reference}'")
-    if measures.motion == "linear":
+    if changes.motion == "linear":
         changes.units["position"] = f"{rounded(1 / ratio, 5):g} m"
         changes.questions["position"] = "is this the size of a count?"
     else:
@@ -144,26 +157,40 @@ def _of_counts(chosen: Chosen, measures: Measures, ratio: float, changes: _Chang
         changes.questions["position"] = (
             f"is a turn of the joint {changes.counts} counts? Else counts_per_revolution"
         )
+    if chosen.velocity:
+        changes.said.append(f"'{chosen.velocity[0].name}' is passed over: nothing states its unit")
     # Without a unit it would have that of the position.
-    changes.units["reference"] = _unit_of_reference(chosen, measures)
+    changes.units["reference"] = wanted
 
 
-def _of_two_units(chosen: Chosen, measures: Measures, ratio: float) -> tuple[str, str] | None:
-    """Return the units of position and reference that have this ratio, if no column states one."""
+def _of_two_units(chosen: Chosen, measures: Measures, ratio: float, changes: _Changes) -> bool:
+    """State two units of which the ratio is that of the strokes; return whether there are two.
+
+    No column may state a unit. Where the motion was guessed by its size, the units decide it.
+    """
     if chosen.position[0].unit or chosen.reference[0].unit or "position" in measures.units:
-        return None
-    pairs = _PAIRS[measures.motion]
-    return next(((of, to) for size, of, to in pairs if abs(ratio / size - 1) < _NEAR), None)
-
-
-def _of_units(chosen: Chosen, units: tuple[str, str], changes: _Changes) -> None:
-    """State two units of which the ratio is that of the ways."""
+        return False
+    guessed = "motion" in measures.questions
+    motions = ("rotary", "linear") if guessed else (measures.motion,)
+    found = [
+        (motion, of, to)
+        for motion in motions
+        for size, of, to in _PAIRS[motion]
+        if abs(ratio / size - 1) < _NEAR
+    ]
+    if not found:
+        return False
+    changes.motion, *units = found[0]
     changes.units |= dict(zip(("position", "reference"), units, strict=True))
+    if chosen.velocity:
+        changes.units["velocity"] = measures.units.get("velocity", f"{units[0]}/s")
+    changes.settled += ["the position is taken to be", "the motion is", "motion"]
     changes.said.append(
         f"'{chosen.position[0].name}' is in {units[0]} and '{chosen.reference[0].name}' in {units[1]}, "
-        "by the ratio of their ways"
+        f"by the ratio of their strokes, {ratio:.4g}"
     )
     changes.questions["position"] = f"is the position in {units[0]}, and the reference in {units[1]}?"
+    return True
 
 
 def _of_gear(chosen: Chosen, measures: Measures, ratio: float, changes: _Changes) -> None:
@@ -171,8 +198,10 @@ def _of_gear(chosen: Chosen, measures: Measures, ratio: float, changes: _Changes
     position, reference = chosen.position[0].name, chosen.reference[0].name
     si, whole = SI[measures.motion], round(ratio)
     ratio = float(whole) if whole and abs(ratio / whole - 1) < _WHOLE else rounded(ratio, 5)
+    at_motor = position if ratio > 1 else reference
     changes.said.append(
-        f"'{position}' moves about {ratio:.4g} times as far as '{reference}', as a motor before a gear"
+        f"'{position}' moves about {ratio:.4g} times as far as '{reference}': a gear is taken to be between "
+        f"them, with '{at_motor}' on the side of the motor"
     )
     changes.questions["position"] = (
         f"is {ratio:g} the ratio of the gear between '{position}' and '{reference}'? Or are their units not "
@@ -203,7 +232,7 @@ def _of_zero(chosen: Chosen, measures: Measures, strokes: Strokes, changes: _Cha
     offset = mean - float(wanted.mean())
     if abs(offset) < _APART * float(np.ptp(wanted)):
         return
-    si = SI[measures.motion]
+    si = SI[changes.motion]
     changes.offset["reference"] = rounded(offset, 6)
     changes.said.append(
         f"'{position.name}' lies {offset:.4g} {si} from '{reference.name}', whose zero is moved"

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from jaxid.first_case.words import FORCES, parts_of
+from jaxid.logs.readers.dialect import split_unit
 from jaxid.logs.rough_inertia import correlation
 from jaxid.logs.units import parse_unit
 
@@ -19,6 +23,8 @@ _OF_MOTOR = frozenset("motor mot m rotor primary".split())
 _MOTION = ("position", "velocity", "acceleration")
 # Correlation of the two positions from which they have one course.
 _SAME_COURSE = 0.95
+# Ways of a load in a turn of its motor [m] that a screw, a belt or a rack may have.
+_LEADS = (2e-4, 0.3)
 
 
 class TwoEncoders(NamedTuple):
@@ -52,7 +58,7 @@ def without_load(columns: Sequence[Column]) -> TwoEncoders:
         beside = of_load & _BESIDE_MOTOR if of_motor & _OF_MOTOR else frozenset()
         words = of_load & _OF_LOAD | beside
         named = bool(words) and not of_motor & _OF_LOAD
-        if not (named or by_screw(motor, load)):
+        if not (named or _of_screw(motor, load, columns)):
             continue
         if abs(correlation(motor.values, load.values)) <= _SAME_COURSE:
             continue
@@ -72,6 +78,26 @@ def by_screw(motor: Column, load: Column) -> bool:
     """Check whether one position is stated as an angle and the other one as a length."""
     units = [parse_unit(column.unit) for column in (motor, load)]
     return [unit and unit.kind for unit in units] == ["angle", "length"]
+
+
+def _of_screw(motor: Column, load: Column, columns: Sequence[Column]) -> bool:
+    """Check whether an angle and a length are those of one drive by their sizes, and not of two joints."""
+    forces = [c for c in columns if c.meaning.quantity in FORCES and not c.meaning.reference]
+    if not by_screw(motor, load) or len(forces) > 1 or _numbers(motor) != _numbers(load):
+        return False
+    angle, length = (_stroke(column) for column in (motor, load))
+    return angle > 0 and _LEADS[0] < 2 * np.pi * length / angle < _LEADS[1]
+
+
+def _stroke(column: Column) -> float:
+    """Return the stroke of a column with a unit, in SI units."""
+    unit = parse_unit(column.unit)
+    return float(np.ptp(column.values)) * (1.0 if unit is None else unit.factor)
+
+
+def _numbers(column: Column) -> set[str]:
+    """Return the numbers in the name of a column, without its unit."""
+    return set(re.findall(r"\d+", split_unit(column.name)[0]))
 
 
 def _words(column: Column) -> frozenset[str]:

@@ -130,8 +130,9 @@ def measures_of(chosen: Chosen, robot: str = "") -> Measures:
     if robot and chosen.force and _of_robot(chosen.force[0]):
         said.append(_of_robot(chosen.force[0]))
     else:
-        # The motor of a screw turns.
-        _force(chosen, "rotary" if screw else motion, units, labels, said, questions)
+        # The motor of a screw turns, but a force is that on its table.
+        turns = screw and bool(chosen.force) and kind_of_force(chosen.force[0]) != "force"
+        _force(chosen, "rotary" if turns else motion, units, labels, said, questions)
     if chosen.reference:
         own = _stated(chosen.reference[0], "position")
         own = "" if counts and per_turn is None else own or units.get("position", "")
@@ -276,8 +277,7 @@ def _force(
     if not chosen.force:
         return
     column = chosen.force[0]
-    stated = parse_unit(_stated(column, "force"))
-    kind = column.meaning.quantity if stated is None else stated.kind
+    stated, kind = parse_unit(_stated(column, "force")), kind_of_force(column)
     mechanical = {"linear": "force", "rotary": "torque"}[motion]
     if kind == mechanical:
         if stated is not None:
@@ -301,6 +301,12 @@ def _force(
     force = "N" if motion == "linear" else "N m"
     said.append(f"results are per {label}: the {force} for one {label}{of} are not known")
     questions["force"] = questions_of_drive(kind, motion, label)
+
+
+def kind_of_force(column: Column) -> str:
+    """Return the kind of a force by its unit, or else by its name."""
+    unit = parse_unit(_stated(column, "force"))
+    return column.meaning.quantity if unit is None else unit.kind
 
 
 def _of_robot(column: Column) -> str:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 _SHARE = 0.01
 # Velocity below which a sample counts as at rest, over the largest one, and fewest samples of a fit.
 _REST, _ENOUGH = 0.02, 20
+# Part of a column of that fit which the columns before it must leave, and samples from which it takes fewer.
+_APART, _MANY = 0.1, 10_000
 
 Signal: TypeAlias = "Float[np.ndarray, ' samples']"
 
@@ -71,12 +73,15 @@ class Strokes(NamedTuple):
 def ratio_of_strokes(first: Signal, second: Signal) -> Strokes:
     """Estimate how many times as far one position moves as another, which it follows or is joined to.
 
-    A coupling gives, and a loop lags, with acceleration and friction, which stand beside the second position
-    in a fit. Of all running means the one that leaves least of the first position decides.
+    A coupling gives, and a loop lags, with velocity, friction and acceleration, which stand beside the second
+    position in a fit, as far as the motion tells them from it. Of all running means the one that leaves least
+    of the first position decides.
 
     Args:
         first, second: Two positions of one length.
     """
+    step = 1 + first.size // _MANY
+    first, second = first[::step], second[::step]
     best = Strokes(0.0, 0.0, np.inf)
     for window in windows(second.size - 2):
         signals = (
@@ -86,17 +91,33 @@ def ratio_of_strokes(first: Signal, second: Signal) -> Strokes:
             second[2:] - 2 * second[1:-1] + second[:-2],
         )
         q, x, v, a = (smooth(s, window) for s in signals)
-        if q.size <= _ENOUGH or q.std() == 0:
+        if q.size <= _ENOUGH or q.std() == 0 or x.std() == 0:
             continue
         moves = np.where(np.abs(v) < _REST * np.abs(v).max(), 0.0, np.sign(v))
-        columns = np.stack([x, a, v, moves, np.ones_like(x)], axis=1)
-        size = np.sqrt(np.mean(columns**2, axis=0))
-        scaled = columns / np.where(size > 0, size, 1.0)
-        theta = np.linalg.lstsq(scaled, q, rcond=1e-8)[0]
-        left = float(np.var(q - scaled @ theta)) / float(np.var(q))
-        if left < best.left and size[0] > 0:
-            best = Strokes(float(theta[0] / size[0]), float(theta[-1]), left)
+        columns = _apart([np.ones_like(x), x - x.mean(), v, moves, a])
+        theta = np.linalg.lstsq(columns, q, rcond=None)[0]
+        left = float(np.var(q - columns @ theta)) / float(np.var(q))
+        if left < best.left:
+            best = Strokes(float(theta[1]), float(theta[0] - theta[1] * x.mean()), left)
     return best
+
+
+def _apart(columns: list[Signal]) -> Float[np.ndarray, "samples k"]:
+    """Return those columns of a fit that those before them do not nearly give, the first two in any case.
+
+    The acceleration of a single sine is its position, and the velocity of a ramp is a constant.
+    """
+    kept, axes = [], []
+    for k, column in enumerate(columns):
+        rest = column.copy()
+        for axis in axes:
+            rest -= (axis @ rest) * axis
+        size = float(np.linalg.norm(rest))
+        if k > 1 and size <= _APART * float(np.linalg.norm(column)):
+            continue
+        kept.append(column)
+        axes.append(rest / size)
+    return np.stack(kept, axis=1)
 
 
 def implied_inertia(

@@ -270,13 +270,23 @@ def converted(
         units, said = _units_of(quantity, values.shape[1], names[quantity], of_file, stated, frame, path)
         if quantity == "force":
             said += _of_motor(units, names[quantity], stated, frame, path)
-        factors = [_factor(u, quantity, k, table, frame, path) for k, u in enumerate(units)]
-        factors = np.array(factors) * np.broadcast_to(np.asarray(signs.get(quantity, 1.0)), values.shape[1])
+        width = values.shape[1]
+        factors = np.array([_factor(u, quantity, k, table, frame, path) for k, u in enumerate(units)])
+        factors = factors * _by_column("sign", quantity, signs.get(quantity, 1.0), width, path)
         out[quantity] = values if np.all(factors == 1.0) else values * factors
         if quantity in offsets:
-            out[quantity] = out[quantity] + np.broadcast_to(np.asarray(offsets[quantity]), values.shape[1])
+            out[quantity] = out[quantity] + _by_column("offset", quantity, offsets[quantity], width, path)
         assumed += said
     return out, assumed
+
+
+def _by_column(key: str, quantity: str, value: Any, width: int, path: str) -> np.ndarray:
+    """Return the numbers that a key states for a quantity, one a column."""
+    numbers = np.atleast_1d(np.asarray(value, float))
+    if numbers.size not in (1, width):
+        what = f"{key}.{quantity} has {numbers.size} entries, and there are {width} columns"
+        raise InputError(what, where=path, hint="give one number for all, or one a column")
+    return np.broadcast_to(numbers, width)
 
 
 def _units_of(

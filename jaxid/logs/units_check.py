@@ -145,7 +145,8 @@ def ratio_findings(
             findings += _compare_velocity(log.velocity[:, joint], q, log.period, motions[joint], where)
         if log.reference is not None and joint in reference_of:
             where = f"{path}, reference of joint {joint + 1}"
-            findings += _compare_reference(log.reference[:, reference_of[joint]], q, motions[joint], where)
+            wanted = log.reference[:, reference_of[joint]]
+            findings += _compare_reference(wanted, q, motions[joint], where, alone=not log.force.any())
     return findings
 
 
@@ -173,32 +174,45 @@ def _compare_velocity(
     return _judge(ratio, _VELOCITY, motion, "velocity is {:.4g} times the derivative", where)
 
 
-def _compare_reference(r: np.ndarray, q: np.ndarray, motion: str, where: str) -> list[Finding]:
-    """Compare a reference with the position that follows it."""
+def _compare_reference(
+    r: np.ndarray, q: np.ndarray, motion: str, where: str, *, alone: bool
+) -> list[Finding]:
+    """Compare a reference with the position that follows it.
+
+    Args:
+        r, q: Reference and position.
+        motion: "linear" or "rotary".
+        where: The column, for messages.
+        alone: Whether the log has no force, so that the reference drives the simulation.
+    """
     similarity = correlation(r, q)
     if np.ptp(r) == 0 or abs(similarity) < _SIMILAR:
         # The loop may be loose, or the reference constant: there is no basis for a verdict.
         return []
     if similarity < 0:
-        what = "the reference has the opposite sign of the position"
-        hint = "if it is that of another direction, say sign = { reference = -1 } in [log]"
+        what = "the reference moves against the position"
+        hint = (
+            "if it counts in the other direction, turn it by sign = { reference = -1 } in [log]; a sign that "
+        )
+        hint += "is stated there may be wrong"
         return [Finding("error", what, where, hint)]
-    way = abs(ratio_of_strokes(q, r).ratio)
-    ratio = 1.0 / way if way > 0 else float(r.std() / q.std())
-    findings = _judge(
-        ratio, _REFERENCE, motion, "the reference is {:.4g} times the position", where, spread=1.1
-    )
+    ratio = float(r.std() / q.std())
+    if not _is_one(ratio):
+        ratio = 1.0 / (ratio_of_strokes(q, r).ratio or 1.0 / ratio)
+    text = "the reference is {:.4g} times the position"
+    findings = _judge(ratio, _REFERENCE, motion, text, where, spread=1.1)
     if not findings:
         return _compare_zero(float(np.mean(q) - np.mean(r)), float(np.ptp(r)), where)
-    if findings[0].severity == "error":
-        return findings
-    unit = "m" if motion == "linear" else "rad"
-    hint = (
-        "check the units of both columns; if the encoder is a motor's in front of a gear, say "
-        f'units = {{ position = "{ratio:.4g} {unit}", reference = "{unit}" }} in [log]'
+    [finding], unit = findings, "m" if motion == "linear" else "rad"
+    example = f'units = {{ position = "{ratio:.4g} {unit}", reference = "{unit}" }}'
+    gear = (
+        "if one of them is on the motor's side of a gear, multiply in [log] the unit of the position and its "
+        f"velocity by {ratio:.4g} ({example}, if no unit is stated)"
     )
-    severity = "warning" if 1 / _ABSURD < ratio < _ABSURD else "error"
-    return [replace(findings[0], severity=severity, hint=hint)]
+    if finding.severity == "error":
+        return [replace(finding, hint=f"{finding.hint}; {gear}")]
+    absurd = alone and not 1 / _ABSURD < ratio < _ABSURD
+    return [replace(finding, severity="error" if absurd else "warning", hint=f"{finding.hint}; {gear}")]
 
 
 def _compare_zero(apart: float, stroke: float, where: str) -> list[Finding]:
@@ -207,17 +221,22 @@ def _compare_zero(apart: float, stroke: float, where: str) -> list[Finding]:
         return []
     what = f"the position lies {apart:.4g} from the reference that it follows"
     hint = (
-        f"if the two count from different zeros, say offset = {{ reference = {apart:.4g} }} in [log]; else a "
+        f"if the two count from different zeros, add {apart:.4g} to the reference by [log] offset; else a "
         "constant load holds the joint away"
     )
     return [Finding("warning", what, where, hint)]
+
+
+def _is_one(ratio: float) -> bool:
+    """Check that a ratio counts as one."""
+    return 0.67 < ratio < 1.5
 
 
 def _judge(
     ratio: float, slips: Sequence[_Slip], motion: str, text: str, where: str, *, spread: float = 1.2
 ) -> list[Finding]:
     """Report a ratio that is not one: an error if a common slip explains it within a spread."""
-    if 0.67 < ratio < 1.5:
+    if _is_one(ratio):
         return []
     finding = text.format(ratio)
     for slip in slips:

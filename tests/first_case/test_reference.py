@@ -30,12 +30,17 @@ def moves():
     return ramp * (0.5 * np.sin(1.9 * T) + 0.3 * np.sin(4.3 * T + 1.0) - 0.3 * np.sin(1.0))
 
 
+def sine(hertz):
+    """Return a motion of one sine [rad]."""
+    return 0.5 * np.sin(2 * np.pi * hertz * T)
+
+
 def steps():
     """Return a motion of steps [rad]."""
     return np.repeat(np.random.default_rng(3).uniform(-0.8, 0.8, 8), T.size // 8)
 
 
-@pytest.mark.parametrize("reference", [moves(), steps()], ids=["sines", "steps"])
+@pytest.mark.parametrize("reference", [moves(), sine(0.5), steps()], ids=["sines", "sine", "steps"])
 def test_a_motor_in_front_of_a_gear_is_brought_to_the_joint_of_its_command(reference):
     joint = followed(reference)
     table = {"t": T, "command": reference, "position": 50.0 * joint}
@@ -44,15 +49,15 @@ def test_a_motor_in_front_of_a_gear_is_brought_to_the_joint_of_its_command(refer
     assert units["reference"] == "rad"
     size, unit = units["position"].split()
     assert unit == "rad"
-    assert float(size) == pytest.approx(0.02, rel=0.02)
+    assert float(size) == pytest.approx(0.02, rel=0.03)
     assert any("times as far as 'command'" in line for line in case.assumed)
     assert any("the ratio of the gear" in line for line in case.questions)
 
 
-def test_the_velocity_goes_with_its_position():
-    joint = followed(moves())
-    speed = np.gradient(50.0 * joint, T)
-    table = {"t": T, "command": moves(), "position": 50.0 * joint, "velocity": speed}
+@pytest.mark.parametrize("factor", [50.0, np.rad2deg(1.0)], ids=["gear", "degrees"])
+def test_the_velocity_goes_with_its_position(factor):
+    joint = factor * followed(moves())
+    table = {"t": T, "command": moves(), "position": joint, "velocity": np.gradient(joint, T)}
     case = jaxid.init(table)
     units = case.tables["log"]["units"]
     assert units["velocity"] == f"{units['position']}/s"
@@ -62,7 +67,10 @@ def test_the_velocity_goes_with_its_position():
 def test_beside_a_force_the_reference_is_brought_to_the_position():
     joint = followed(moves())
     table = {"t": T, "command": moves(), "position": 50.0 * joint, "torque": np.sin(T)}
-    assert jaxid.init(table).tables["log"]["units"] == {"reference": "50.199 rad"}
+    [(quantity, text)] = jaxid.init(table).tables["log"]["units"].items()
+    size, unit = text.split()
+    assert (quantity, unit) == ("reference", "rad")
+    assert float(size) == pytest.approx(50.0, rel=0.01)
 
 
 @pytest.mark.parametrize(("counts", "error"), [(4096, 0.0), (10_000, 0.01)])
@@ -79,6 +87,32 @@ def test_degrees_beside_radians_are_units_and_no_gear():
     table = {"t": T, "command": moves(), "position": np.rad2deg(followed(moves()))}
     case = jaxid.init(table)
     assert case.tables["log"]["units"] == {"position": "deg", "reference": "rad"}
+
+
+def test_counts_of_a_slide_have_the_size_of_a_length():
+    table = {"t": T, "command [mm]": 100 * moves(), "position": np.round(followed(moves()) * 40_960)}
+    case = jaxid.init(table)
+    assert case.tables["plant"]["motion"] == "linear"
+    size, unit = case.tables["log"]["units"]["position"].split()
+    assert unit == "m"
+    assert float(size) == pytest.approx(0.1 / 40_960, rel=0.01)
+    jaxid.open_session(case.case(), table)
+
+
+def test_units_decide_a_motion_that_was_guessed_by_its_size():
+    case = jaxid.init({"t": T, "command": 0.3 * moves(), "position": 300.0 * followed(moves())})
+    assert case.tables["plant"]["motion"] == "linear"
+    assert case.tables["log"]["units"] == {"position": "mm", "reference": "m"}
+    assert not any(
+        "taken to be" in line or "no axis has" in line for line in case.assumed if "loop" not in line
+    )
+
+
+def test_a_motion_beyond_the_bandwidth_has_no_gear_and_no_sign():
+    """The position lags by more than a quarter of a turn."""
+    table = {"t": T, "command": sine(9.0), "position": followed(sine(9.0))}
+    assert np.corrcoef(table["command"], table["position"])[0, 1] < -0.5
+    assert not {"units", "sign"} & {*jaxid.init(table).tables["log"]}
 
 
 def test_a_position_that_moves_against_its_command_has_the_sign_of_this_turned():

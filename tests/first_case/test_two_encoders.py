@@ -158,6 +158,43 @@ def test_a_gear_between_two_encoders_is_found_exactly(log):
     assert result.estimate.value("load_inertia") == pytest.approx(JOINT.true["load_inertia"], rel=0.02)
 
 
+@pytest.mark.parametrize(("unit", "gain"), [("N", 1.0), ("kN", 1.0)])
+def test_a_force_beside_a_screw_is_that_on_its_table(log, unit, gain):
+    size = {"N": 1.0, "kN": 1e3}[unit]
+    table = {
+        "t": log["t"],
+        "angle [deg]": np.rad2deg(log["q_motor"] * 2 * np.pi / 0.005),
+        "table position [mm]": 1e3 * log["q_load"],
+        f"force [{unit}]": log["torque"] / size,
+    }
+    case = jaxid.init(table)
+    assert case.tables["actuator"]["gain"] == gain
+    assert np.allclose(jaxid.open_session(case.case(), table).fits[0].log.force[:, 0], log["torque"])
+
+
+@pytest.mark.parametrize(
+    "names", [("theta1 [deg]", "z2 [mm]", "f [N]"), ("theta [deg]", "z [mm]", "tau [Nm]")]
+)
+def test_joints_that_turn_and_slide_together_are_no_screw(log, names):
+    """Joints of different numbers, and a travel of 0.6 m in a turn, which no screw has."""
+    one, other, force = names
+    table = {
+        "t": log["t"],
+        one: np.rad2deg(log["q_motor"]),
+        other: 100.0 * log["q_load"],
+        force: log["torque"],
+    }
+    columns = columns_of({name: x[:, None] for name, x in table.items()}, {}, "t")
+    assert choose(columns, "log").load is None
+
+
+def test_a_turned_reference_of_a_load_is_left_out_with_its_sign(log):
+    table = {"t": log["t"], "q_motor": 1.3 * log["q_motor"], "q_load": log["q_load"]}
+    table |= {"q_ref": -log["q_load"], "torque": log["torque"]}
+    log_table = jaxid.init(table).tables["log"]
+    assert ("reference" in log_table) == ("reference" in log_table.get("sign", {}))
+
+
 def test_the_resonance_does_not_move_the_ratio(log):
     """A regression of the two positions alone is half a percent off where the load swings further."""
     motor, load = log["q_motor"], log["q_load"]

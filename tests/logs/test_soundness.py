@@ -11,6 +11,7 @@ from jaxid.errors import InputError
 from jaxid.logs.log import Log, read_log
 from jaxid.logs.rough_inertia import correlation, implied_inertia, smooth
 from jaxid.logs.soundness import Finding, check_log, plausible_inertia, raise_on_error
+from jaxid.logs.units_check import ratio_findings
 from truth.axis.stepper import Loop, Machine, Sensor, simulate
 
 INERTIA, VISCOUS, COULOMB = 12.0, 30.0, 8.0
@@ -176,21 +177,24 @@ def test_reference_by_an_unusual_factor_is_a_warning():
     found(scaled(axis_log(), reference=5.0), "warning", "which should be 1")
 
 
-def test_a_reference_behind_a_gear_says_how_the_position_is_brought_to_it():
-    """A ratio of 50 is not that of degrees to radians, 57.3."""
-    finding = found(scaled(axis_log(), reference=0.02), "error", "which should be 1", motion="rotary")
+@pytest.mark.parametrize(("force", "severity"), [(0.0, "error"), (1.0, "warning")])
+def test_a_reference_behind_a_gear_says_how_the_position_is_brought_to_it(force, severity):
+    """A ratio of 50 is not that of degrees to radians, 57.3; without a force the reference is what drives."""
+    log = dataclasses.replace(scaled(axis_log(), reference=0.02), force=force * axis_log().force)
+    [finding] = ratio_findings(log, "rotary", "log")
+    assert (finding.severity, "which should be 1" in finding.what) == (severity, True)
     assert 'units = { position = "0.02 rad", reference = "rad" }' in finding.hint
 
 
 def test_a_reference_of_the_opposite_sign_is_refused():
-    finding = found(scaled(axis_log(), reference=-1.0), "error", "opposite sign of the position")
+    finding = found(scaled(axis_log(), reference=-1.0), "error", "moves against the position")
     assert "sign = { reference = -1 }" in finding.hint
 
 
 def test_a_reference_with_another_zero_is_a_warning():
     log = axis_log()
     far = dataclasses.replace(log, position=log.position + 2.0 * np.ptp(log.position), velocity=None)
-    assert "offset = { reference = " in found(far, "warning", "from the reference that it follows").hint
+    assert "by [log] offset" in found(far, "warning", "from the reference that it follows").hint
     near = dataclasses.replace(log, position=log.position + 0.1 * np.ptp(log.position), velocity=None)
     assert check_log(near) == []
 

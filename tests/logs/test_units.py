@@ -160,7 +160,12 @@ def test_a_reference_has_the_unit_of_the_position_and_that_is_said():
         ({"units": {"velocity": "rpm"}}, ROTARY, "units.velocity converts nothing"),
         ({"sign": {"reference": -1}}, ROTARY, "sign.reference converts nothing"),
         ({"offset": {"reference": 1.0}}, ROTARY, "offset.reference converts nothing"),
-        ({"offset": {"force": 1.0}}, ROTARY, "force"),
+        (
+            {"offset": {"position": [1.0, 2.0]}},
+            ROTARY,
+            "offset.position has 2 entries, and there are 1 columns",
+        ),
+        ({"sign": {"position": [1, -1]}}, ROTARY, "sign.position has 2 entries, and there are 1 columns"),
         ({"sign": {"force": 2}}, ROTARY, "sign.force = 2 is no sign; give 1 or -1"),
         ({"units": {"force": "N"}}, ROTARY, "the force is in N, and joint 1 turns"),
         ({"units": {"force": "N m"}}, LINEAR, "the force is in N m, and joint 1 slides"),
