@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxid.errors import InputError
 from jaxid.first_case.balance import has_direction
 from jaxid.first_case.two_encoders import TwoEncoders, without_load
-from jaxid.first_case.words import FORCES, Meaning, meaning_of_joint
+from jaxid.first_case.words import FORCES, PHASES, Meaning, meaning_of_joint
 from jaxid.logs.log import MINIMUM_SAMPLES
 from jaxid.logs.readers.dialect import split_unit
 from jaxid.logs.rough_inertia import correlation
@@ -186,6 +186,7 @@ def choose(columns: Sequence[Column], where: str, *, of_robot: bool = False) -> 
     questions: dict[str, str] = {}
     time = _time(columns, said, questions)
     rest = [c for c in columns if c is not time and c.meaning.quantity not in ("time", "passed over")]
+    rest = _without_phases(rest, said)
     if not any(c.meaning.quantity in ("position", "velocity") for c in rest):
         rest = _named_by_unit(rest)
     split = TwoEncoders(rest, None) if of_robot else without_load(rest)
@@ -221,6 +222,21 @@ def choose(columns: Sequence[Column], where: str, *, of_robot: bool = False) -> 
         said=tuple(said),
         questions=questions,
     )
+
+
+def _without_phases(columns: Sequence[Column], said: list[str]) -> list[Column]:
+    """Return columns without the currents and voltages of a motor's phases, of which there are several."""
+
+    def of_phase(column: Column) -> bool:
+        meaning = column.meaning
+        return meaning.quantity in ("current", "voltage") and bool(PHASES & {*meaning.joint})
+
+    found = [c for c in columns if of_phase(c)]
+    if len({phase for c in found for phase in PHASES & {*c.meaning.joint}}) < 2:
+        return [*columns]
+    names = ", ".join(f"'{c.name}'" for c in found)
+    said.append(f"{names} are not used: no phase of a motor shows its torque by itself; its q current does")
+    return [c for c in columns if not of_phase(c)]
 
 
 def _time(columns: Sequence[Column], said: list[str], questions: dict[str, str]) -> Column | None:

@@ -31,7 +31,7 @@ _QUANTITIES: dict[str, str] = {
     "zwischenkreis gyro gyros gyroscope gyr accelerometer magnetometer",
 }
 _ROLES = {
-    "reference": "ref reference soll sollwert target desired des cmd command commanded setpoint set goal "
+    "reference": "ref reference soll sollwert target desired des cmd command commanded setpoint sp set goal "
     "demand demanded wanted action vorgabe fuehrung",
     "actual": "ist istwert act actual meas measured gemessen feedback fbk fb value wert present actualvalue",
 }
@@ -63,6 +63,12 @@ _LETTERS = {
 }
 # Quantities that a letter and one more letter stand for, as qm or qg.
 _OF_Q = re.compile(r"q[a-z]")
+# Phases of a motor, each of which has a current and a voltage.
+PHASES = frozenset("u v w".split())
+# Symbols of motor and load without a sign, as in thetam.
+_OF_SIDE = re.compile(r"(?i)\b(theta|th|phi|omega|w|tau)([ml])\b")
+# Letters of German drives behind which the role stands without a sign, as in Iist and n_soll.
+_WITH_ROLE = re.compile(r"(?i)\b([a-z])(ist|soll)\b")
 ROTARY = _TURNS | frozenset("winkel drehwinkel angle angles ang drehzahl omega rpm dof tau".split())
 LINEAR = frozenset("weg hub displacement hoehe height distance".split())
 # Units with a capital, which begins no word.
@@ -162,6 +168,8 @@ class _Words:
             self.leading = word
         elif word == "dd" and moved:
             self.derivatives += 2
+        elif word in PHASES and {*self.quantities} & {"current", "voltage"}:
+            self.joint.append(word)
         elif word in _DOTS:
             self.derivatives += _DOTS[word]
         elif word in _DERIVATIVES:
@@ -207,6 +215,8 @@ class _Words:
         quantities, joint = self._said(), list(self.joint)
         if quantities == ["load"] and self.symbol in _TURNS:
             quantities = ["position", "load"]  # theta_load is the angle of a load
+        if "n" in self.words and self.roles and not quantities:
+            quantities = ["velocity"]  # n_soll and n_ist of German drives
         if "twist" in joint and self.kinds and not self.quantities:
             # The message of a velocity, as twist.angular.z; by itself it may be an angle.
             quantities = ["velocity"]
@@ -313,6 +323,7 @@ def _split(name: str) -> list[str]:
     """Split a name at signs, capitals and digits."""
     spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z]{2})", " ", name)
     spaced = re.sub(r"(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])", " ", spaced)
+    spaced = _OF_SIDE.sub(r"\1 \2", _WITH_ROLE.sub(r"\1 \2", spaced))
     # A current or a voltage of the q axis may be split by its sign.
     spaced = re.sub(r"(?i)\b([iu])_q\b", r"\1q", spaced)
     return re.findall(r"[A-Za-z]+|\d+|%", spaced)

@@ -339,6 +339,22 @@ def test_a_column_that_is_left_out_is_said():
     assert any("no name says what they are: 'carriage'" in line for line in first.assumed)
 
 
+@pytest.mark.parametrize("more", [(), ("i_q",)])
+def test_currents_of_phases_are_no_force(more):
+    t = np.arange(0.0, 5.0, 0.002)
+    q = t * np.sin(t)
+    torque = np.gradient(np.gradient(q, t), t) + 0.1 * np.sign(np.gradient(q, t))
+    phases = {f"i_{name}": torque * np.cos(7 * q + 2 * np.pi * k / 3) for k, name in enumerate("uvw")}
+    table = {"t": t, "theta": q, **phases, **dict.fromkeys(more, torque)}
+    if not more:
+        with pytest.raises(InputError, match="no column is a force"):
+            jaxid.init(table)
+        return
+    case = jaxid.init(table)
+    assert case.tables["log"]["force"] == "i_q"
+    assert any("'i_u', 'i_v', 'i_w' are not used" in line for line in case.assumed)
+
+
 def test_what_is_refused(tmp_path, capsys):
     log = write_csv(tmp_path / "log.csv", signals())
     out = tmp_path / "case.toml"
