@@ -94,18 +94,21 @@ def ratio_of_strokes(first: Signal, second: Signal) -> Strokes:
         if q.size <= _ENOUGH or q.std() == 0 or x.std() == 0:
             continue
         moves = np.where(np.abs(v) < _REST * np.abs(v).max(), 0.0, np.sign(v))
-        columns = _apart([np.ones_like(x), x - x.mean(), v, moves, a])
+        columns, accelerates = _apart([np.ones_like(x), x - x.mean(), v, moves, a])
         theta = np.linalg.lstsq(columns, q, rcond=None)[0]
         left = float(np.var(q - columns @ theta)) / float(np.var(q))
         if left < best.left:
-            best = Strokes(float(theta[1]), float(theta[0] - theta[1] * x.mean()), left)
+            # Of a single sine only the amplitude is that of the stroke: acceleration acts as position does.
+            ratio = float(theta[1]) if accelerates else float(np.copysign(q.std() / x.std(), theta[1]))
+            best = Strokes(ratio, float(theta[0] - ratio * x.mean()), left)
     return best
 
 
-def _apart(columns: list[Signal]) -> Float[np.ndarray, "samples k"]:
-    """Return those columns of a fit that those before them do not nearly give, the first two in any case.
+def _apart(columns: list[Signal]) -> tuple[Float[np.ndarray, "samples k"], bool]:
+    """Return those columns of a fit that those before them do not nearly give, and whether the last is one.
 
-    The acceleration of a single sine is its position, and the velocity of a ramp is a constant.
+    The acceleration of a single sine is its position, and the velocity of a ramp is a constant. The first two
+    columns stay in any case.
     """
     kept, axes = [], []
     for k, column in enumerate(columns):
@@ -117,7 +120,7 @@ def _apart(columns: list[Signal]) -> Float[np.ndarray, "samples k"]:
             continue
         kept.append(column)
         axes.append(rest / size)
-    return np.stack(kept, axis=1)
+    return np.stack(kept, axis=1), kept[-1] is columns[-1]
 
 
 def implied_inertia(

@@ -173,16 +173,15 @@ def test_a_force_beside_a_screw_is_that_on_its_table(log, unit, gain):
 
 
 @pytest.mark.parametrize(
-    "names", [("theta1 [deg]", "z2 [mm]", "f [N]"), ("theta [deg]", "z [mm]", "tau [Nm]")]
+    ("one", "other", "size"), [("theta1 [deg]", "z2 [mm]", 5.0), ("theta [deg]", "z [mm]", 100.0)]
 )
-def test_joints_that_turn_and_slide_together_are_no_screw(log, names):
-    """Joints of different numbers, and a travel of 0.6 m in a turn, which no screw has."""
-    one, other, force = names
+def test_joints_that_turn_and_slide_together_are_no_screw(log, one, other, size):
+    """Joints of different numbers, or a travel of 0.6 m in a turn, which no screw has."""
     table = {
         "t": log["t"],
         one: np.rad2deg(log["q_motor"]),
-        other: 100.0 * log["q_load"],
-        force: log["torque"],
+        other: size * log["q_load"],
+        "tau": log["torque"],
     }
     columns = columns_of({name: x[:, None] for name, x in table.items()}, {}, "t")
     assert choose(columns, "log").load is None
