@@ -122,10 +122,10 @@ class FlexibleDraft(Draft):
         return drive
 
     def _screw(self, slope: float, table: Section) -> Section:
-        """Return the table of a screw, rack or belt that turns an angle into a way.
+        """Return the table of a screw, rack or belt that turns an angle into a travel.
 
         Args:
-            slope: Angle of the motor for a way of the load [rad/m].
+            slope: Angle of the motor for the travel of the load [rad/m].
             table: The table of the log.
         """
         lead = 1e-3 * _near_whole(1e3 * 2 * np.pi / slope)

@@ -191,14 +191,13 @@ def _compare_reference(
         return []
     if similarity < 0:
         what = "the reference moves against the position"
-        hint = (
-            "if it counts in the other direction, turn it by sign = { reference = -1 } in [log]; a sign that "
-        )
-        hint += "is stated there may be wrong"
+        turn = "if it counts in the other direction, turn it by sign = { reference = -1 } in [log]"
+        hint = f"{turn}; a sign that is stated there may be wrong"
         return [Finding("error", what, where, hint)]
     ratio = float(r.std() / q.std())
     if not _is_one(ratio):
-        ratio = 1.0 / (ratio_of_strokes(q, r).ratio or 1.0 / ratio)
+        way = ratio_of_strokes(q, r).ratio
+        ratio = 1.0 / way if way > 0 else ratio
     text = "the reference is {:.4g} times the position"
     findings = _judge(ratio, _REFERENCE, motion, text, where, spread=1.1)
     if not findings:
