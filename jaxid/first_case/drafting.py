@@ -22,7 +22,7 @@ from jaxid.first_case.units import Measures
 from jaxid.logs.in_memory import LogLike, as_log
 from jaxid.logs.log import Log
 from jaxid.logs.soundness import position_levels
-from jaxid.logs.units import Frame, parse_unit
+from jaxid.logs.units import Frame
 from jaxid.model.units import Units
 from jaxid.numerics.filters import high_band_std
 from jaxid.settings import Actuator
@@ -203,7 +203,7 @@ class Draft:
             keys = {"kind": kind, key: {"guess": rounded(value)}}
             return Section("[[effects]]", keys, {key: units.label(dimension)})
 
-        # The distance from the reference is known to some per cent of the way.
+        # The distance from the reference is known to some per cent of the stroke.
         constant = []
         if self._measures.offset:
             constant = [effect("constant_force", "level", 0.01 * inertia * rate**2 * stroke, "force")]
@@ -398,11 +398,7 @@ class Draft:
 
     def _factor(self, quantity: str) -> float:
         """Return the size of one unit of a column, in the unit of results."""
-        unit = parse_unit(self._measures.units.get(quantity, ""))
-        if unit is None:
-            return 1.0
-        counts = self._measures.counts
-        return unit.factor if unit.kind != "count" or counts is None else 2 * np.pi / counts
+        return self._measures.size(quantity)
 
     # reading
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxid.first_case.balance import rough_balance
 from jaxid.first_case.columns import Column
 from jaxid.first_case.drafting import Draft, driven_balance, positive_friction
-from jaxid.first_case.section import Section, rounded
+from jaxid.first_case.section import Section, near_whole, rounded
 from jaxid.first_case.two_encoders import by_screw
 from jaxid.first_case.units import kind_of_force
 from jaxid.logs.rough_inertia import ratio_of_strokes
@@ -111,7 +111,7 @@ class FlexibleDraft(Draft):
             return self._screw(slope, table)
         if 1 / _GEARED < slope < _GEARED:
             return None
-        ratio = _near_whole(slope)
+        ratio = near_whole(slope, _WHOLE)
         drive = Section("[actuator]", {"gear_ratio": ratio})
         drive.assumed.append(f"the motor turns {slope:.6g} times as far as the load")
         drive.questions.append("is this the ratio of the gear?")
@@ -128,9 +128,10 @@ class FlexibleDraft(Draft):
             slope: Angle of the motor for the travel of the load [rad/m].
             table: The table of the log.
         """
-        lead = 1e-3 * _near_whole(1e3 * 2 * np.pi / slope)
-        drive = Section("[actuator]", {"gear_ratio": 1.0, "lead": rounded(lead, 6)}, {"lead": "m/rev"})
-        drive.assumed.append(f"the load moves {1e3 * 2 * np.pi / slope:.6g} mm in a turn of the motor")
+        travel = 1e3 * 2 * np.pi / slope
+        lead = rounded(1e-3 * near_whole(travel, _WHOLE), 6)
+        drive = Section("[actuator]", {"gear_ratio": 1.0, "lead": lead}, {"lead": "m/rev"})
+        drive.assumed.append(f"the load moves {travel:.6g} mm in a turn of the motor")
         drive.questions.append("is this the lead of the screw, or the travel of rack or belt in a turn?")
         drive.questions.append("are the two positions those of one drive, and not of two joints?")
         self._of_motor(drive, 2 * np.pi / lead, table)
@@ -180,9 +181,3 @@ class FlexibleDraft(Draft):
             '"0.018 deg" } the case can be one of kind = "flexible_axis" (docs/case_file.md)'
         )
         return sections
-
-
-def _near_whole(ratio: float) -> float:
-    """Return the whole number that is near a ratio; the ratio itself if none is."""
-    whole = round(ratio)
-    return float(whole) if whole and abs(ratio / whole - 1) < _WHOLE else rounded(ratio, 5)

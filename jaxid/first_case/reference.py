@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from jaxid.first_case.columns import Chosen
-from jaxid.first_case.section import rounded
+from jaxid.first_case.section import near_whole, rounded
 from jaxid.first_case.units import SI, Measures
 from jaxid.logs.rough_inertia import Strokes, correlation, ratio_of_strokes
-from jaxid.logs.units import fits, parse_unit
+from jaxid.logs.units import fits, parse_unit, size_of
 
 # Correlation from which a position follows its reference, and the part of its variance that may be left.
 _ALIKE, _FOLLOWED = 0.9, 0.05
@@ -21,18 +21,17 @@ _APART = 0.05
 # Within so much of a whole number a ratio is that. Dry friction moves a ratio by some 1 %: so near to a power
 # of two are the counts of a turn, and twice that near to the ratio of two units are these.
 _WHOLE, _POWER, _NEAR = 5e-4, 0.01, 0.02
-_DEGREES = 180.0 / np.pi
-# Units of position and reference by the ratio of their strokes, where no column states one.
+# Units of position and reference that the ratio of their strokes shows, where no column states one.
 _PAIRS = {
     "rotary": (
-        (_DEGREES, "deg", "rad"),
-        (1 / _DEGREES, "rad", "deg"),
-        (2 * np.pi, "rad", "rev"),
-        (1 / (2 * np.pi), "rev", "rad"),
-        (360.0, "deg", "rev"),
-        (1 / 360.0, "rev", "deg"),
+        ("deg", "rad"),
+        ("rad", "deg"),
+        ("rad", "rev"),
+        ("rev", "rad"),
+        ("deg", "rev"),
+        ("rev", "deg"),
     ),
-    "linear": ((1e3, "mm", "m"), (1e-3, "m", "mm"), (1e6, "um", "m"), (1e-6, "m", "um")),
+    "linear": (("mm", "m"), ("m", "mm"), ("um", "m"), ("m", "um")),
 }
 
 
@@ -46,7 +45,7 @@ class _Changes:
         said, questions: New lines, see `Measures`.
         settled: Beginnings of older lines, and quantities of older questions, that no longer hold.
         counts: Counts of a turn; None: positions are not brought from counts to an angle.
-        sign, offset: Signs that are turned and zeros that are moved, by quantity.
+        sign: Signs that are turned, by quantity.
     """
 
     motion: str
@@ -56,7 +55,6 @@ class _Changes:
     settled: list[str] = field(default_factory=list)
     counts: int | None = None
     sign: dict[str, int] = field(default_factory=dict)
-    offset: dict[str, float] = field(default_factory=dict)
 
     def on(self, measures: Measures) -> Measures:
         """Return measures with these changes."""
@@ -72,7 +70,6 @@ class _Changes:
             questions={**questions, **self.questions},
             counts=self.counts,
             sign=self.sign,
-            offset=self.offset,
         )
 
 
@@ -97,8 +94,7 @@ def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
         return measures
 
     changes = _Changes(measures.motion)
-    size = 1.0 if counted else _size(measures.units.get("position", ""))
-    ratio = strokes.ratio * size / _size(_unit_of_reference(chosen, measures))
+    ratio = strokes.ratio * measures.size("position") / size_of(_unit_of_reference(chosen, measures))
     if ratio < 0:
         _turned(chosen, changes)
     if not 1 / _SAME < abs(ratio) < _SAME:
@@ -106,21 +102,16 @@ def beside_reference(chosen: Chosen, measures: Measures) -> Measures:
             _of_counts(chosen, measures, abs(ratio), changes)
         elif not _of_two_units(chosen, measures, abs(ratio), changes):
             _of_gear(chosen, measures, abs(ratio), changes)
-    if not chosen.force and ("position" in changes.units or not counted):
-        _of_zero(chosen, measures, strokes, changes)
-    return changes.on(measures)
+    changed = changes.on(measures)
+    if chosen.force or "position" in changed.labels:
+        return changed
+    return _with_zero(chosen, changed, strokes)
 
 
 def _of_other_kinds(measures: Measures) -> bool:
     """Check whether one of position and reference is an angle and the other one a length."""
     units = [parse_unit(measures.units.get(quantity, "")) for quantity in ("position", "reference")]
     return {"angle", "length"} == {unit.kind for unit in units if unit is not None}
-
-
-def _size(unit: str) -> float:
-    """Return a unit in SI units; 1 if there is none."""
-    found = parse_unit(unit)
-    return 1.0 if found is None else found.factor
 
 
 def _unit_of_reference(chosen: Chosen, measures: Measures) -> str:
@@ -175,8 +166,8 @@ def _of_two_units(chosen: Chosen, measures: Measures, ratio: float, changes: _Ch
     found = [
         (motion, of, to)
         for motion in motions
-        for size, of, to in _PAIRS[motion]
-        if abs(ratio / size - 1) < _NEAR
+        for of, to in _PAIRS[motion]
+        if abs(ratio * size_of(of) / size_of(to) - 1) < _NEAR
     ]
     if not found:
         return False
@@ -196,8 +187,7 @@ def _of_two_units(chosen: Chosen, measures: Measures, ratio: float, changes: _Ch
 def _of_gear(chosen: Chosen, measures: Measures, ratio: float, changes: _Changes) -> None:
     """Bring position and reference to one place where a gear is between them."""
     position, reference = chosen.position[0].name, chosen.reference[0].name
-    si, whole = SI[measures.motion], round(ratio)
-    ratio = float(whole) if whole and abs(ratio / whole - 1) < _WHOLE else rounded(ratio, 5)
+    si, ratio = SI[measures.motion], near_whole(ratio, _WHOLE)
     at_motor = position if ratio > 1 else reference
     changes.said.append(
         f"'{position}' moves about {ratio:.4g} times as far as '{reference}': a gear is taken to be between "
@@ -218,26 +208,25 @@ def _of_gear(chosen: Chosen, measures: Measures, ratio: float, changes: _Changes
     changes.units["reference"] = _unit_of_reference(chosen, measures)
 
 
-def _of_zero(chosen: Chosen, measures: Measures, strokes: Strokes, changes: _Changes) -> None:
-    """Move the zero of a reference that its position follows at a distance."""
+def _with_zero(chosen: Chosen, measures: Measures, strokes: Strokes) -> Measures:
+    """Return measures with the zero of a reference moved, if its position follows it at a distance."""
     position, reference = chosen.position[0], chosen.reference[0]
-    units = {**measures.units, **changes.units}
-    of_position = _size(units.get("position", ""))
-    if changes.counts is not None:
-        of_position = 2 * np.pi / changes.counts
-    wanted = reference.values * _size(units.get("reference") or _unit_of_reference(chosen, measures))
-    wanted = wanted * changes.sign.get("reference", 1)
+    size = size_of(_unit_of_reference(chosen, measures)) * measures.sign.get("reference", 1)
+    wanted = reference.values * size
     # The fit at the mean of the reference, where an error of the ratio does not count.
-    mean = (strokes.ratio * float(reference.values.mean()) + strokes.offset) * of_position
-    offset = mean - float(wanted.mean())
+    mean = strokes.ratio * float(reference.values.mean()) + strokes.offset
+    offset = mean * measures.size("position") - float(wanted.mean())
     if abs(offset) < _APART * float(np.ptp(wanted)):
-        return
-    si = SI[changes.motion]
-    changes.offset["reference"] = rounded(offset, 6)
-    changes.said.append(
-        f"'{position.name}' lies {offset:.4g} {si} from '{reference.name}', whose zero is moved"
-    )
-    changes.questions["offset"] = (
+        return measures
+    distance = f"{offset:.4g} {SI[measures.motion]}"
+    said = f"'{position.name}' lies {distance} from '{reference.name}', whose zero is moved"
+    question = (
         f"do '{position.name}' and '{reference.name}' count from different zeros? Else a constant load holds "
         "the joint away, and offset is to be left out"
+    )
+    return replace(
+        measures,
+        offset={"reference": rounded(offset, 6)},
+        said=(*measures.said, said),
+        questions={**measures.questions, "offset": question},
     )

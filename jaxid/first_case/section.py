@@ -85,6 +85,12 @@ def rounded(value: float, digits: int = 2) -> float:
     return float(f"{value:.{digits - 1}e}")
 
 
+def near_whole(ratio: float, within: float) -> float:
+    """Return the whole number that a ratio is within a part of; else the ratio, rounded to five digits."""
+    whole = round(ratio)
+    return float(whole) if whole and abs(ratio / whole - 1) < within else rounded(ratio, 5)
+
+
 def case_text(title: Sequence[str], sections: Sequence[Section]) -> str:
     """Return a whole case: lines of comment, then its tables."""
     head = [line for text in title for line in _wrapped("# ", text)]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxid.first_case.words import FORCES, parts_of
 from jaxid.logs.readers.dialect import split_unit
 from jaxid.logs.rough_inertia import correlation
-from jaxid.logs.units import parse_unit
+from jaxid.logs.units import parse_unit, size_of
 
 if TYPE_CHECKING:
     from jaxid.first_case.columns import Column
@@ -23,7 +23,7 @@ _OF_MOTOR = frozenset("motor mot m rotor primary".split())
 _MOTION = ("position", "velocity", "acceleration")
 # Correlation of the two positions from which they have one course.
 _SAME_COURSE = 0.95
-# Ways of a load in a turn of its motor [m] that a screw, a belt or a rack may have.
+# Travel of a load in a turn of its motor [m] that a screw, a belt or a rack may have.
 _LEADS = (2e-4, 0.3)
 
 
@@ -91,8 +91,7 @@ def _of_screw(motor: Column, load: Column, columns: Sequence[Column]) -> bool:
 
 def _stroke(column: Column) -> float:
     """Return the stroke of a column with a unit, in SI units."""
-    unit = parse_unit(column.unit)
-    return float(np.ptp(column.values)) * (1.0 if unit is None else unit.factor)
+    return float(np.ptp(column.values)) * size_of(column.unit)
 
 
 def _numbers(column: Column) -> set[str]:

@@ -70,6 +70,13 @@ class Measures:
     sign: Mapping[str, int] = field(default_factory=dict)
     offset: Mapping[str, float] = field(default_factory=dict)
 
+    def size(self, quantity: str) -> float:
+        """Return the size of one unit of a column, in the unit of results."""
+        unit = parse_unit(self.units.get(quantity, ""))
+        if unit is not None and unit.kind == "count" and self.counts is not None:
+            return 2 * math.pi / self.counts
+        return 1.0 if unit is None else unit.factor
+
 
 def measures_of(chosen: Chosen, robot: str = "") -> Measures:
     """Return units and motion of the chosen columns, of joints of one kind.

@@ -60,7 +60,7 @@ class Strokes(NamedTuple):
     """How far one position moves beside another.
 
     Args:
-        ratio: Way of the first over that of the second; negative if they move against each other.
+        ratio: Stroke of the first over that of the second; negative if they move against each other.
         offset: The first where the second is zero, of positions at rest.
         left: Part of the variance of the first that its fit leaves.
     """

@@ -166,6 +166,12 @@ def parse_unit(text: str) -> Unit | None:
     return None
 
 
+def size_of(text: str) -> float:
+    """Return a unit in SI units, or in counts; 1 if it is not known."""
+    unit = parse_unit(text)
+    return 1.0 if unit is None else unit.factor
+
+
 def need_unit(text: str, quantity: str, where: str) -> Unit:
     """Return the unit that a user states for a quantity.
 
