@@ -193,9 +193,9 @@ def test_a_reference_of_the_opposite_sign_is_refused():
 
 def test_a_reference_with_another_zero_is_a_warning():
     log = axis_log()
-    far = dataclasses.replace(log, position=log.position + 2.0 * np.ptp(log.position), velocity=None)
+    far = dataclasses.replace(log, position=log.position + 0.45 * np.ptp(log.position), velocity=None)
     assert "by [log] offset" in found(far, "warning", "from the reference that it follows").hint
-    near = dataclasses.replace(log, position=log.position + 0.1 * np.ptp(log.position), velocity=None)
+    near = dataclasses.replace(log, position=log.position + 0.25 * np.ptp(log.position), velocity=None)
     assert check_log(near) == []
 
 
