@@ -29,8 +29,8 @@ _NANO = 500_000.0
 _SIMILAR = 0.9
 # Chosen: a reference that is so many times the position, or so small a part of it, is not the position's.
 _ABSURD = 10.0
-# Chosen: a position so many strokes away from its reference has another zero, or hangs on a load. Weight holds
-# a joint of the SO-101 arm away by up to 0.25 strokes of its command.
+# Chosen: a position so many strokes away from its reference has another zero, or hangs on a load. Weight
+# holds a joint of the SO-101 arm away by up to 0.25 strokes of its command.
 _FAR_APART = 0.35
 
 
