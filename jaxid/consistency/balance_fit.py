@@ -9,7 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 import scipy.optimize
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
@@ -43,6 +43,7 @@ class BalanceFit:
         velocity: Velocity at the kept samples, (kept, n).
         counts: Mask of the samples that count, (kept, n).
         scale: Size of the force of each joint without its part that depends on position only, (n,).
+        gains: Joints whose drive has an unknown gain that the log may show, 0-based; see `rough_gains`.
     """
 
     unknowns: tuple[Free, ...]
@@ -53,6 +54,7 @@ class BalanceFit:
     velocity: Float[np.ndarray, "kept n"]
     counts: Bool[np.ndarray, "kept n"]
     scale: Float[np.ndarray, " n"]
+    gains: tuple[int, ...] = ()
 
     @property
     def names(self) -> list[str]:
@@ -96,6 +98,17 @@ class BalanceFit:
         """Return model minus declared force for values of the unknowns and undeclared forces, (kept, n)."""
         p = len(self.unknowns)
         return self.known + self.columns @ values[:p] + self.potential @ values[p:]
+
+    def with_gains(self) -> BalanceFit:
+        """Return the balance with the declared forces of unknown gains among the undeclared forces.
+
+        Model minus gain times force is linear in the gain. A gain at a guess that is some per cent off hides
+        a shift of the force in time.
+        """
+        more = np.zeros((*self.force.shape, len(self.gains)))
+        for k, joint in enumerate(self.gains):
+            more[:, joint, k] = self.force[:, joint]
+        return replace(self, potential=np.concatenate([self.potential, more], axis=2))
 
     def rms(self, residual: np.ndarray) -> Float[np.ndarray, " n"]:
         """Return the RMS of a residual at the samples that count, by joint."""
@@ -169,17 +182,17 @@ def rough_gains(machine: Machine, data: Prepared) -> RoughGains | None:
         The fit; None if no gain is unknown, or all are, so that nothing has a scale, or if the balance is
         not finite.
     """
-    parameters = machine.parameters
-    gains = np.array([_is_gain(machine.plant, f) for f in parameters.free], dtype=bool)
-    if not gains.any() or gains.sum() >= data.force.shape[1]:
+    parameters, places = machine.parameters, _places_of_gains(machine, data)
+    if places is None:
         return None
+    gains = np.isin(np.arange(len(parameters.free)), places)
     fitted = gains | np.array([_is_force(machine.plant, f) for f in parameters.free], dtype=bool)
     plant, arrays = sharpened(machine.plant, data), ForceData.of(data, data.fitted)
     guess = np.asarray(parameters.guess, dtype=np.float64)
     e, columns = (np.asarray(x) for x in force_and_columns(plant, parameters.places, arrays, guess))
 
     # The residual is the model over the gain, minus the declared force: times the gain it is linear.
-    declared, places = np.asarray(measured_force(plant, arrays)), np.flatnonzero(gains)
+    declared = np.asarray(measured_force(plant, arrays))
     joints = [_joint_of(machine.plant, parameters.free[k]) for k in places]
     factor = np.ones(e.shape[1])
     factor[joints] = guess[places]
@@ -243,6 +256,8 @@ def balance_fits(
     velocity = np.asarray(data.recipe.decimator(data.qd))
     typical = np.abs(declared[1] * np.asarray(theta)[linear]).max(axis=2, initial=0.0)
     scale = _scales(force, potential, typical, data.fitted)
+    places_of_gains = _places_of_gains(machine, data)
+    gains = [] if places_of_gains is None else [machine.parameters.free[k] for k in places_of_gains]
     base = BalanceFit(
         unknowns=tuple(f for f, of in zip(machine.parameters.free, linear, strict=True) if of),
         columns=declared[1],
@@ -252,6 +267,7 @@ def balance_fits(
         velocity=velocity,
         counts=data.fitted,
         scale=scale,
+        gains=tuple(_joint_of(machine.plant, gain) for gain in gains),
     )
     out = []
     for chosen in turned:
@@ -261,6 +277,16 @@ def balance_fits(
         )
         out.append(replace(base, known=known, columns=columns))
     return out
+
+
+def _places_of_gains(machine: Machine, data: Prepared) -> Int[np.ndarray, " k"] | None:
+    """Return the places of the unknown gains of drives that a log may show; None if there are none.
+
+    If all gains are unknown, nothing has a scale.
+    """
+    free = machine.parameters.free
+    places = np.array([k for k, f in enumerate(free) if _is_gain(machine.plant, f)], dtype=int)
+    return places if 0 < len(places) < data.force.shape[1] else None
 
 
 def _is_gain(plant: Plant, free: Free) -> bool:

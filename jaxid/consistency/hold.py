@@ -62,7 +62,7 @@ def better_hold(
     other = holds[log.hold]
     held = data.recipe.hold(replace(log, hold=other), machine.hold_period)
     wider = with_friction(fit)
-    residuals = [wider.fit(bounded=False)[1], residual_held(machine, data, wider, held)]
+    residuals = [residual_held(machine, data, wider, time) for time in (data.hold, held)]
 
     gaps = np.array([fit.rms(e) for e in residuals])
     driven = [int(j) for j in machine.plant.driven(machine.plant.joints)]
@@ -87,6 +87,8 @@ def residual_held(
 ) -> Float[np.ndarray, "kept n"]:
     """Return the residual of a balance, fitted anew, if each force acts for another time.
 
+    Unknown gains of drives are fitted, too.
+
     Args:
         machine: The machine.
         data: The prepared log.
@@ -95,7 +97,8 @@ def residual_held(
     """
     arrays = (ForceData.of(replace(data, hold=h)) for h in (data.hold, held))
     now, then = (np.asarray(measured_force(machine.plant, a)) for a in arrays)
-    return replace(fit, known=fit.known + now - then).fit(bounded=False)[1]
+    moved = replace(fit, known=fit.known + now - then, force=then)
+    return moved.with_gains().fit(bounded=False)[1]
 
 
 def clearly_better(

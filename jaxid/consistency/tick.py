@@ -25,11 +25,13 @@ class Tick(NamedTuple):
 
     Args:
         period: The time [s].
+        std: Standard deviation of the time, by the likelihood of those that were tried [s].
         evidence: Gain in log-likelihood over lines and over a force that is held for a row [nats]; None: the
             log shows that the loop is faster, and its noise leaves the time uncertain.
     """
 
     period: float
+    std: float
     evidence: float | None
 
     def finding(self, log: Log) -> Finding:
@@ -42,8 +44,8 @@ class Tick(NamedTuple):
         """Return the entry of `settings` in result.json."""
         if self.evidence is None:
             reason = "the force answers to the noise of its own row's reading only, as that of a faster loop"
-        else:
-            reason = f"it raises the log-likelihood by {self.evidence:.3g} over held forces and over lines"
+            return {"value": f"{self.period:.3g} s", "reason": f"{reason}; known to {self.std:.2g} s"}
+        reason = f"it raises the log-likelihood by {self.evidence:.3g} over held forces and over lines"
         return {"value": f"{self.period:.3g} s", "reason": reason}
 
 
@@ -84,16 +86,19 @@ def faster_tick(
     times = [log.period / rows for rows in _TICKS]
     costs = np.array([cost(held) for held in times])
     best = int(np.argmin(costs))
-    left = residual(times[best])
-    count = independent(left / fit.scale, fit.counts)
+    count = independent(residual(times[best]) / fit.scale, fit.counts)
     lines, row = cost(0.0), cost(log.period)
     evidence = count * float(np.log(min(lines, row) / costs[best]))
+
+    possible, weights = np.array([*times, 0.0]), (np.append(costs, lines) / costs[best]) ** -count
+    weights /= weights.sum()
+    mean = float(possible @ weights)
+    spread = lambda about: float(np.sqrt((possible - about) ** 2 @ weights))
     if fast and evidence < -_EVIDENCE and row < lines:
         # A loop of the log's rate with a filtered derivative answers to its row's noise nearly alone, too.
-        return Tick(log.period, evidence)
+        return Tick(log.period, 0.0, evidence)
     if fast and evidence < _EVIDENCE:
-        weights = (np.append(costs, lines) / costs[best]) ** -count
-        return Tick(float([*times, 0.0] @ weights / weights.sum()), None)
+        return Tick(mean, spread(mean), None)
     if evidence < _EVIDENCE:
         return None
-    return Tick(times[best], evidence)
+    return Tick(times[best], spread(times[best]), evidence)

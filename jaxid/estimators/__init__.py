@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -344,6 +345,8 @@ _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 
 # Methods that simulate, and accept options of the simulation.
 SIMULATING = ("output_error", "within_prior", "instrumental_variable", "didim")
+# Methods that solve balances of the measured force, which depend on the time for which each force acts.
+BALANCING = ("inverse_dynamics", "instrumental_variable", "didim", "power", "algebraic")
 
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
     "output_error": _output_error,
@@ -412,15 +415,17 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
             "does not take them with several logs" if session.more else "does not simulate the loop with them"
         )
         need_known_controller(session, f"{method} {why}")
-    if method == "within_prior":
-        steps = METHODS[method]
-    else:
+    steps = METHODS[method]
+    if method in BALANCING and any(run.data.hold_std for run in session.fits):
+        from jaxid.estimators.uncertain_hold import with_uncertain_hold
+
+        steps = partial(with_uncertain_hold, METHODS[method])
+    if method != "within_prior":
         from jaxid.estimators.common.shapes import seen_shapes
 
         # A prior says something about every shape; other methods know what the log shows.
-        steps = lambda *args, **kwargs: seen_shapes(
-            METHODS[method](*args, **kwargs), session.machine.parameters.guess
-        )
+        of_method, guess = steps, session.machine.parameters.guess
+        steps = lambda *args, **kwargs: seen_shapes(of_method(*args, **kwargs), guess)
     if not session.case.identification.physically_consistent:
         return steps(session, **options)
     from jaxid.estimators.common.consistency import need_bodies, with_links

@@ -383,8 +383,7 @@ def _precision(
 
     if any(log.part.data.faster_loop for log in logs):
         found = found.widened(widening(plain, jacobian, e, counts, [len(row.residual) for row in rows]))
-    by_noise = _UNCERTAIN * solution.slope
-    found = replace(found, covariance=found.covariance + np.outer(by_noise, by_noise))
+    found = found.with_error(_UNCERTAIN * solution.slope)
     return plain, _without_hidden(found, plain, names, theta, solution.hidden)
 
 

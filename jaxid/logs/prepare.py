@@ -169,6 +169,7 @@ class Prepared:
             rad, (m,), if that loop is faster; None: there is none.
         high_band: Noise of the force in its high band, as it was logged, (m,); None: that of the log. See
             `jaxid.simulation.sensor_noise.high_band_force_noise`.
+        hold_std: Standard deviation of `hold`, if it was estimated from the log [s].
     """
 
     q: Float[np.ndarray, "time n"]
@@ -188,6 +189,11 @@ class Prepared:
     faster_loop: bool = False
     answer: Float[np.ndarray, " m"] | None = None
     high_band: Float[np.ndarray, " m"] | None = None
+    hold_std: float = 0.0
+
+    def with_longer_hold(self) -> Prepared:
+        """Return the log with each force held for one standard deviation longer."""
+        return replace(self, hold=self.hold + self.hold_std)
 
     @property
     def times(self) -> Float[np.ndarray, " kept"]:

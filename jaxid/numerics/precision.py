@@ -80,6 +80,19 @@ class Precision:
             equivalent_variance=None if white is None else white * factor**2,
         )
 
+    def with_error(self, change: Float[np.ndarray, " p"]) -> Precision:
+        """Return the precision with one more error, independent of the others.
+
+        Args:
+            change: Change of the values by one standard deviation of the error, (p,).
+        """
+        whole, white = self.covariance + np.outer(change, change), self.equivalent_variance
+        if white is not None:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = np.diag(whole) / np.diag(self.covariance)
+            white = white * np.where(np.isfinite(ratio), ratio, 1.0)
+        return replace(self, covariance=whole, equivalent_variance=white)
+
     def first(self, names: list[str]) -> Precision:
         """Return the precision of the first parameters, which have these names, without the nuisances."""
         p = len(names)

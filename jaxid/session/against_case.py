@@ -19,7 +19,7 @@ from jaxid.consistency.reference_hold import (
     reference_hold_setting,
 )
 from jaxid.consistency.sign import sign_findings
-from jaxid.consistency.tick import faster_tick
+from jaxid.consistency.tick import Tick, faster_tick
 from jaxid.consistency.timing import timing_findings
 from jaxid.consistency.weight import weight_findings
 from jaxid.logs.soundness import Finding, raise_on_error
@@ -39,7 +39,7 @@ class AgainstCase:
         force_noise: Estimated noise of the force.
         settings: Choices made from the log; see `Session`.
         clipped: Rows in which the recording of a force is clipped, (samples, drives); None: none.
-        held: Time for which each force acts, if it is less than a row [s]; None: it is not.
+        tick: Time for which each force acts, if it is less than a row; None: it is not.
     """
 
     findings: list[Finding]
@@ -48,7 +48,7 @@ class AgainstCase:
     force_noise: ForceNoise
     settings: dict[str, dict[str, str]]
     clipped: np.ndarray | None = None
-    held: float | None = None
+    tick: Tick | None = None
 
 
 def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold: bool) -> AgainstCase:
@@ -95,6 +95,7 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
             settings["hold"] = hold_setting(log.hold, *better, machine.unit("force"))
             opened = under_hold(hold, opened, machine)
             log, data = opened.log, opened.data
+            machine = with_rough_gains(machine, data)
             declared = balance_fits(machine, data)[0]
 
     tick = None
@@ -111,6 +112,7 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
             opened = under_hold(hold, opened, machine)
             log, data = opened.log, opened.data
         data = replace(data, hold=tick.period)
+        machine = with_rough_gains(machine, data)
         declared = balance_fits(machine, data)[0]
 
     if better is None or free_hold:  # a wrong hold is half a sample late
@@ -130,8 +132,8 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
     noise = estimated_force_noise(machine, log, data, declared, made, fast=fast)
     findings += noise_findings(machine, log, data, declared, noise.std)
     left_out = None if clipped is None else clipped[0]
-    held = None if tick is None or of_row else tick.period
-    return AgainstCase(findings, hold, machine.reference_hold, noise, settings, left_out, held)
+    faster = None if of_row else tick
+    return AgainstCase(findings, hold, machine.reference_hold, noise, settings, left_out, faster)
 
 
 def _with_reference_hold(

@@ -91,8 +91,8 @@ def session_of_faster_loop(session: Session, machine: Machine) -> Session | None
     noise = estimated_force_noise(at_fit, held.fit.log, data, balance_fits(at_fit, data)[0], fast=True)
     return replace(
         held,
-        fit=with_force_noise(held.fit, noise, tick.period),
-        validations=tuple(with_force_noise(other, noise, tick.period) for other in held.validations),
+        fit=with_force_noise(held.fit, noise, tick),
+        validations=tuple(with_force_noise(other, noise, tick) for other in held.validations),
         findings=(*session.findings, tick.finding(run.log)),
         settings={**session.settings, "tick": tick.setting()},
         chooses_hold=False,

@@ -273,8 +273,8 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
     machine, opened, more = session.machine, [session.fit, *session.validations], list(session.more)
 
     # The logs to validate on are of the same sensors and the same loop.
-    opened = [with_force_noise(run, found.force_noise, found.held) for run in opened]
-    if found.held is not None:
+    opened = [with_force_noise(run, found.force_noise, found.tick) for run in opened]
+    if found.tick is not None:
         session = replace(session, chooses_hold=False)
     findings = [*session.findings, *found.findings]
     for k, run in enumerate(more):
@@ -284,7 +284,7 @@ def _held_against_case(session: Session, *, several: bool) -> Session:
         if also.clipped is not None:
             run = without_clipped(run, also.clipped, machine)
         same_rate = run.log.period == fit.log.period
-        run = with_force_noise(run, also.force_noise, found.held if same_rate else None)
+        run = with_force_noise(run, also.force_noise, found.tick if same_rate else None)
         other = None if also.reference_hold == machine.reference_hold else also.reference_hold
         more[k] = replace(run, reference_hold=run.reference_hold or other)
     return replace(
@@ -365,7 +365,8 @@ def open_another(session: Session, log: LogLike) -> OpenedLog:
     if opened.log.hold != machine.hold:
         opened = under_hold(machine.hold, opened, machine)
     if "tick" in session.settings:
-        opened = replace(opened, data=replace(opened.data, hold=known.hold))
+        data = replace(opened.data, hold=known.hold, hold_std=known.hold_std)
+        opened = replace(opened, data=data)
     return opened
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool
 
 from jaxid.case.case import Case
 from jaxid.consistency.noise import ForceNoise
+from jaxid.consistency.tick import Tick
 from jaxid.errors import InputError
 from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared, Recipe, choose_recipe, prepare
@@ -43,16 +44,18 @@ def under_hold(hold: str, opened: OpenedLog, machine: Machine) -> OpenedLog:
     return replace(opened, log=log, data=replace(opened.data, hold=held))
 
 
-def with_force_noise(opened: OpenedLog, noise: ForceNoise, tick: float | None = None) -> OpenedLog:
+def with_force_noise(opened: OpenedLog, noise: ForceNoise, tick: Tick | None = None) -> OpenedLog:
     """Return a log with the noise of its force.
 
     Args:
         opened: The log.
         noise: The noise.
-        tick: Time for which each force acts [s]; None: as before.
+        tick: Time for which each force acts; None: as before.
     """
     data = replace(opened.data, force_noise=noise.std, faster_loop=noise.faster_loop, answer=noise.answer)
-    return replace(opened, data=data if tick is None else replace(data, hold=tick))
+    if tick is not None:
+        data = replace(data, hold=tick.period, hold_std=tick.std)
+    return replace(opened, data=data)
 
 
 def without_clipped(opened: OpenedLog, rows: Bool[np.ndarray, "samples m"], machine: Machine) -> OpenedLog:

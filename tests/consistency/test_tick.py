@@ -8,6 +8,8 @@ import pytest
 
 import jaxid
 from jaxid.consistency.noise import loop_is_faster
+from jaxid.estimators import METHODS, steps_of
+from jaxid.numerics.lanes import run_alone
 from jaxid.session import Session, open_another, open_session
 from truth.axis.cases import case_text
 from truth.axis.machines import Setup, moves
@@ -106,6 +108,28 @@ def test_values_of_a_faster_loop_hold_and_nothing_is_missing(every):
     assert tuple(fit.names) == ("inertia", "viscous_friction.coefficient", "coulomb_friction.level")
     frictions = (EFFECTS["viscous_friction"]["coefficient"], EFFECTS["coulomb_friction"]["level"])
     assert np.all(np.abs(fit.theta - [SETUP.machine.inertia, *frictions]) < 3 * fit.std)
+
+
+def test_the_uncertainty_of_the_tick_is_an_error_of_the_values():
+    """Half the tick shifts the force in time, as a viscous friction beside the inertia does."""
+    session = opened(5)
+    data = session.fit.data
+    assert 0.2 / RATE < data.hold_std < 2 / RATE
+    fit = run_alone(steps_of("inverse_dynamics", session))
+    longer = replace(session, fit=replace(session.fit, data=replace(data, hold=data.hold + data.hold_std)))
+    known, other = (run_alone(METHODS["inverse_dynamics"](of)) for of in (session, longer))
+    np.testing.assert_array_equal(fit.theta, known.theta)
+    np.testing.assert_allclose(fit.std, np.hypot(known.std, other.theta - known.theta), rtol=1e-9)
+    beside = fit.std_misspecified, known.std_misspecified
+    np.testing.assert_allclose(beside[0], np.hypot(beside[1], other.theta - known.theta), rtol=1e-9)
+    assert np.max(fit.std / known.std) > 1.005
+
+
+def test_a_tick_that_is_known_adds_no_error():
+    session = opened(1)
+    assert session.fit.data.hold_std == 0.0
+    fit = run_alone(steps_of("inverse_dynamics", session))
+    np.testing.assert_array_equal(fit.std, run_alone(METHODS["inverse_dynamics"](session)).std)
 
 
 def test_a_filtered_derivative_at_the_rate_of_the_log_is_no_faster_loop():

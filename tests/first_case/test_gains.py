@@ -40,13 +40,32 @@ GANTRY = """<robot name="gantry">
 """
 
 
-def recorded(links: TwoLinks, constants: np.ndarray, seed: int, rate: int = 1000, seconds: float = 6.0):
+def drawn(seed: int) -> tuple[TwoLinks, np.ndarray]:
+    """Draw an arm and the torque constants of its drives."""
+    rng = np.random.default_rng([9, seed])
+    size = lambda value: value * rng.uniform(0.8, 1.2)
+    links = TwoLinks(
+        **{name: size(value) for name, value in LINKS.items()},
+        viscous=(size(1.5), size(0.8)),
+        coulomb=(size(2.0), size(1.2)),
+    )
+    return links, np.array([size(5.0), size(8.0)])
+
+
+def recorded(
+    links: TwoLinks,
+    constants: np.ndarray,
+    seed: int,
+    rate: int = 1000,
+    seconds: float = 6.0,
+    noisy: bool = True,
+):
     """Return the log of an arm of two links, by its closed-form equations, in a loop of 1 kHz."""
     t = np.arange(round(1000 * seconds)) / 1000
     wanted = np.stack([multisine(t, [0.2, 0.5, 0.9, 1.7], 1.2, 2 * seed + k) for k in range(2)], axis=1)
     count = 2 * np.pi / 2**17
-    law = {"kp": (300.0, 150.0), "kd": (30.0, 10.0), "force_noise": 0.05, "seed": seed}
-    read = {"resolution": count, "noise": 0.5 * count}
+    law = {"kp": (300.0, 150.0), "kd": (30.0, 10.0), "force_noise": 0.05 * noisy, "seed": seed}
+    read = {"resolution": count, "noise": 0.5 * count} if noisy else {}
     run = run_sampled(links, rate=1000.0, start=wanted[0], reference=wanted, **read, **law)
     torque = np.stack([run["u1"], run["u2"]], axis=1)
     log = {"t": t} | {f"actual_q_{k}": run[f"q{k + 1}"] for k in range(2)}
@@ -87,6 +106,18 @@ def test_the_ratio_of_torque_constants_is_an_unknown_that_the_log_shows(arm):
         assert abs(found - value) < min(4 * std, 0.02 * value), name
 
 
+def test_the_tick_of_a_faster_loop_is_found_beside_an_unknown_gain(tmp_path):
+    """With the gain 2 per cent off, half a row seems to be the tick, which moves the gain by as much."""
+    (tmp_path / "arm.urdf").write_text(ARM)
+    links, constants = drawn(29)
+    log = recorded(links, constants, 29, 200, seconds=8.0, noisy=False)
+    first = jaxid.init(log, urdf=tmp_path / "arm.urdf", folder=tmp_path)
+    fit = jaxid.identify(first.case(), log, method="inverse_dynamics")
+    assert fit.session.settings["tick"]["value"] == "0.001 s"
+    gain = fit.estimate.value("actuator_gain[2].gain")
+    assert gain == pytest.approx(constants[1] / constants[0], rel=5e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "rate",
@@ -96,14 +127,7 @@ def test_intervals_of_gains_hold_their_share(tmp_path, rate):
     (tmp_path / "arm.urdf").write_text(ARM)
     hold, runs = 0, 24
     for seed in range(runs):
-        drawn = np.random.default_rng([9, seed])
-        size = lambda value, of=drawn: value * of.uniform(0.8, 1.2)
-        links = TwoLinks(
-            **{name: size(value) for name, value in LINKS.items()},
-            viscous=(size(1.5), size(0.8)),
-            coulomb=(size(2.0), size(1.2)),
-        )
-        constants = np.array([size(5.0), size(8.0)])
+        links, constants = drawn(seed)
         log = recorded(links, constants, seed, rate, seconds=8.0)
         first = jaxid.init(log, urdf=tmp_path / "arm.urdf", folder=tmp_path)
         fit = jaxid.identify(first.case(), log).estimate
