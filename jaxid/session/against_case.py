@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxid.build import drives_of_case
 from jaxid.case.case import Case
@@ -22,6 +23,7 @@ from jaxid.consistency.sign import sign_findings
 from jaxid.consistency.tick import Tick, faster_tick
 from jaxid.consistency.timing import timing_findings
 from jaxid.consistency.weight import weight_findings
+from jaxid.logs.log import Log
 from jaxid.logs.soundness import Finding, raise_on_error
 from jaxid.machine import Machine
 from jaxid.session.opened import OpenedLog
@@ -47,7 +49,7 @@ class AgainstCase:
     reference_hold: str
     force_noise: ForceNoise
     settings: dict[str, dict[str, str]]
-    clipped: np.ndarray | None = None
+    clipped: Bool[np.ndarray, "samples m"] | None = None
     tick: Tick | None = None
 
 
@@ -63,77 +65,148 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
     Raises:
         InputError: If the log contradicts the case.
     """
-    log, data = opened.log, opened.data
-    if log.passive:
+    nothing = AgainstCase(
+        [], None, machine.reference_hold, ForceNoise(np.zeros(opened.log.force.shape[1])), {}
+    )
+    if opened.log.passive:
         # Sign, hold and noise of a force, and a law, need a force.
-        return AgainstCase([], None, machine.reference_hold, ForceNoise(np.zeros(log.force.shape[1])), {})
-    machine = with_rough_gains(machine, data)
-    declared = balance_fits(machine, data)[0]
-    if not declared.finite:
-        return AgainstCase([], None, machine.reference_hold, ForceNoise(np.zeros(log.force.shape[1])), {})
-    gain = None
-    if case.actuator.transmission is None and case.actuator.torque_constant is None:
-        gain = drives_of_case(case, machine.plant).gain.tolist()
-    findings = sign_findings(machine, log, data, declared, gain)
-    raise_on_error(findings)
+        return nothing
+    comparison = _Comparison(case, machine, opened)
+    if not comparison.declared.finite:
+        return nothing
 
-    clipped = clipped_force(machine, log, data, declared)
-    if clipped is not None:
-        findings.append(clipped[1])
-        opened = without_clipped(opened, clipped[0], machine)
-        log, data = opened.log, opened.data
-        declared = replace(declared, counts=data.fitted)
+    comparison.take_sign()
+    comparison.take_clipped_rows()
+    comparison.take_hold(free_hold)
+    comparison.take_tick(free_hold)
+    comparison.take_law()
+    return comparison.with_noise()
 
-    hold, better, settings = None, better_hold(machine, log, data, declared), {}
-    if clipped is not None:
-        rows = f"{int(clipped[0].any(axis=1).sum())} rows"
-        settings["clipped_force"] = {"value": rows, "reason": clipped[1].what}
-    if better is not None:
-        findings.append(hold_finding(log, *better, machine.unit("force"), used=free_hold))
-        if free_hold:
-            hold = better[0]
-            settings["hold"] = hold_setting(log.hold, *better, machine.unit("force"))
-            opened = under_hold(hold, opened, machine)
-            log, data = opened.log, opened.data
-            machine = with_rough_gains(machine, data)
-            declared = balance_fits(machine, data)[0]
 
-    tick = None
-    if free_hold:
-        fast = loop_is_faster(machine, log, likely=hold == "linear")
-        tick = faster_tick(machine, log, data, declared, fast=fast)
-    of_row = tick is not None and tick.period == log.period
-    if tick is not None and not of_row:
-        findings.append(tick.finding(log))
-        settings["tick"] = tick.setting()
+class _Comparison:
+    """A log while it is held against its case.
+
+    Each step adds its findings, and what it chooses holds in the next ones.
+    """
+
+    def __init__(self, case: Case, machine: Machine, opened: OpenedLog) -> None:
+        self.case = case
+        self.opened, self.data = opened, opened.data
+        self.findings: list[Finding] = []
+        self.settings: dict[str, dict[str, str]] = {}
+        self.hold: str | None = None
+        self.tick: Tick | None = None
+        self.clipped: Bool[np.ndarray, "samples m"] | None = None
+        # Whether the loop is faster than the log; None: it is known not to be.
+        self.faster: bool | None = False
+        # Whether another hold than the stated one is clearly better.
+        self.contradicted = False
+        # Command of the declared law; None: it does not reproduce the logged one.
+        self.command: Float[np.ndarray, "time m"] | None = None
+        self._balance(machine)
+
+    @property
+    def log(self) -> Log:
+        """The log under the hold that was chosen."""
+        return self.opened.log
+
+    def _balance(self, machine: Machine) -> None:
+        """Fit the balance of forces along the log as it is prepared now."""
+        self.machine = with_rough_gains(machine, self.data)
+        self.declared = balance_fits(self.machine, self.data)[0]
+
+    def _take_opened(self, opened: OpenedLog) -> None:
+        self.opened, self.data = opened, opened.data
+
+    def take_sign(self) -> None:
+        """Refuse a force that does not push."""
+        gain, actuator = None, self.case.actuator
+        if actuator.transmission is None and actuator.torque_constant is None:
+            gain = drives_of_case(self.case, self.machine.plant).gain.tolist()
+        self.findings += sign_findings(self.machine, self.log, self.data, self.declared, gain)
+        raise_on_error(self.findings)
+
+    def take_clipped_rows(self) -> None:
+        """Leave out the rows in which the recording of a force is clipped."""
+        found = clipped_force(self.machine, self.log, self.data, self.declared)
+        if found is None:
+            return
+        self.clipped, finding = found
+        self.findings.append(finding)
+        rows = f"{int(self.clipped.any(axis=1).sum())} rows"
+        self.settings["clipped_force"] = {"value": rows, "reason": finding.what}
+        self._take_opened(without_clipped(self.opened, self.clipped, self.machine))
+        self.declared = replace(self.declared, counts=self.data.fitted)
+
+    def take_hold(self, free: bool) -> None:
+        """Compare the courses of the force between samples; take the better one if none is stated."""
+        unit = self.machine.unit("force")
+        better = better_hold(self.machine, self.log, self.data, self.declared)
+        self.contradicted = better is not None and not free
+        if better is None:
+            return
+        self.findings.append(hold_finding(self.log, *better, unit, used=free))
+        if free:
+            self.settings["hold"] = hold_setting(self.log.hold, *better, unit)
+            self._take_other_hold(better[0])
+            self._balance(self.machine)
+
+    def _take_other_hold(self, hold: str) -> None:
+        self.hold = hold
+        self._take_opened(under_hold(hold, self.opened, self.machine))
+
+    def take_tick(self, free: bool) -> None:
+        """Take the time for which each force acts in the log of a faster loop, if no hold is stated."""
+        if not free:
+            return
+        fast = loop_is_faster(self.machine, self.log, likely=self.hold == "linear")
+        tick = faster_tick(self.machine, self.log, self.data, self.declared, fast=fast)
+        if tick is None:
+            return
+        if tick.period == self.log.period:
+            self.faster = None
+            return
+
+        self.tick, self.faster = tick, True
+        self.findings.append(tick.finding(self.log))
+        self.settings["tick"] = tick.setting()
         # Of the two courses that a simulation has, lines are nearer to a force that acts for half a row.
-        if log.hold != "linear":
-            hold = "linear"
-            opened = under_hold(hold, opened, machine)
-            log, data = opened.log, opened.data
-        data = replace(data, hold=tick.period)
-        machine = with_rough_gains(machine, data)
-        declared = balance_fits(machine, data)[0]
+        if self.log.hold != "linear":
+            self._take_other_hold("linear")
+        self.data = replace(self.data, hold=tick.period)
+        self._balance(self.machine)
 
-    if better is None or free_hold:  # a wrong hold is half a sample late
-        findings += timing_findings(machine, log, data, declared)
-    confirmed = False
-    if case.log is not None and case.log.reference is not None:
-        machine, doubts, setting, confirmed = _with_reference_hold(case, machine, opened, declared)
-        findings, settings = [*findings, *doubts], settings | setting
-    replayed = replayed_law(machine, log)
-    findings += law_findings(machine, log, replayed, confirmed=confirmed)
-    findings += loop_velocity_findings(machine, log)
-    raise_on_error(findings)
+    def take_law(self) -> None:
+        """Compare times of force and position, the course of the reference, and the declared control law."""
+        if not self.contradicted:  # a wrong hold is half a sample late
+            self.findings += timing_findings(self.machine, self.log, self.data, self.declared)
+        confirmed = False
+        if self.case.log is not None and self.case.log.reference is not None:
+            found = _with_reference_hold(self.case, self.machine, self.opened, self.declared)
+            self.machine, doubts, setting, confirmed = found
+            self.findings += doubts
+            self.settings |= setting
+        replayed = replayed_law(self.machine, self.log)
+        self.findings += law_findings(self.machine, self.log, replayed, confirmed=confirmed)
+        self.findings += loop_velocity_findings(self.machine, self.log)
+        raise_on_error(self.findings)
+        self.command = replayed.command if replayed is not None and replayed.exact else None
 
-    findings += weight_findings(machine, log, declared)
-    made = replayed.command if replayed is not None and replayed.exact else None
-    fast = None if of_row else tick is not None
-    noise = estimated_force_noise(machine, log, data, declared, made, fast=fast)
-    findings += noise_findings(machine, log, data, declared, noise.std)
-    left_out = None if clipped is None else clipped[0]
-    faster = None if of_row else tick
-    return AgainstCase(findings, hold, machine.reference_hold, noise, settings, left_out, faster)
+    def with_noise(self) -> AgainstCase:
+        """Estimate the noise of the force, and return the whole comparison."""
+        parts = (self.machine, self.log, self.data, self.declared)
+        self.findings += weight_findings(self.machine, self.log, self.declared)
+        noise = estimated_force_noise(*parts, self.command, fast=self.faster)
+        self.findings += noise_findings(*parts, noise.std)
+        return AgainstCase(
+            findings=self.findings,
+            hold=self.hold,
+            reference_hold=self.machine.reference_hold,
+            force_noise=noise,
+            settings=self.settings,
+            clipped=self.clipped,
+            tick=self.tick,
+        )
 
 
 def _with_reference_hold(
