@@ -90,7 +90,8 @@ def faster_tick(
     lines, row = cost(0.0), cost(log.period)
     evidence = count * float(np.log(min(lines, row) / costs[best]))
 
-    possible, weights = np.array([*times, 0.0]), (np.append(costs, lines) / costs[best]) ** -count
+    possible, all_costs = np.array([*times, 0.0]), np.append(costs, lines)
+    weights = (all_costs / all_costs.min()) ** -count
     weights /= weights.sum()
     mean = float(possible @ weights)
     spread = lambda about: float(np.sqrt((possible - about) ** 2 @ weights))

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import jaxid
+from jaxid.consistency import tick
+from jaxid.consistency.balance_fit import balance_fits
 from jaxid.consistency.noise import loop_is_faster
 from jaxid.estimators import METHODS, steps_of
 from jaxid.numerics.lanes import run_alone
@@ -130,6 +132,17 @@ def test_a_tick_that_is_known_adds_no_error():
     assert session.fit.data.hold_std == 0.0
     fit = run_alone(steps_of("inverse_dynamics", session))
     np.testing.assert_array_equal(fit.std, run_alone(METHODS["inverse_dynamics"](session)).std)
+
+
+def test_lines_that_explain_far_more_leave_a_finite_tick(monkeypatch):
+    """The likelihood of lines over that of the best tick is then no number of double precision."""
+    session = opened(2)
+    machine, log, data = session.machine, session.fit.log, session.fit.data
+    left = tick.residual_held
+    monkeypatch.setattr(tick, "residual_held", lambda *args: left(*args) * (1e-4 if args[-1] == 0 else 1.0))
+    found = tick.faster_tick(machine, log, data, balance_fits(machine, data)[0], fast=True)
+    assert found is not None
+    assert (found.period, found.std) == pytest.approx((0.0, 0.0), abs=1e-9)
 
 
 def test_a_filtered_derivative_at_the_rate_of_the_log_is_no_faster_loop():
