@@ -42,6 +42,7 @@ from jaxid.estimators.needs import need_force, need_known_controller, need_known
 from jaxid.estimators.reading_noise import without_reading_noise
 from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
 from jaxid.estimators.several.parts import parts_of
+from jaxid.estimators.uncertain_hold import with_uncertain_hold
 from jaxid.gap import Gap, filter_floor, force_gap, gaps, noise_floor
 from jaxid.logs.in_memory import LogLike
 from jaxid.logs.log import Log
@@ -392,13 +393,13 @@ def _as_bodies_in_simulation(session: Session, start: Estimate, refit: bool) -> 
         known = session.machine.parameters.guess
         at = start.machine.with_estimate([*known, *start.theta[len(known) :]])
         bodies = need_bodies(session.with_machine(at))
-        start = run_alone(with_links(_of_force_steps(bodies), bodies))
+        start = run_alone(with_links(with_uncertain_hold(_of_force_steps, bodies), bodies))
     return in_simulation(session, start, refit)
 
 
 def _of_force(session: Session) -> Estimate:
     """Return the estimate by inverse dynamics of one log or of several."""
-    return run_alone(_of_force_steps(session))
+    return run_alone(with_uncertain_hold(_of_force_steps, session))
 
 
 def _of_force_steps(session: Session) -> Steps[Estimate]:

@@ -36,8 +36,6 @@ UNKNOWN_OF_FORCES = ("base", "armature", "damping", "frictionloss")
 UNKNOWN_OF_SERVOS = ("damping", "frictionloss", "kp", "kv", "delay", "forcerange")
 # Values of a file beside an unknown loop; a URDF has no rotors.
 UNKNOWN_BESIDE_LOOP = ("armature", "damping", "frictionloss")
-# Largest standard deviation of a rough gain, as a part of it, for which it is an unknown of a first case.
-_SHOWN = 0.05
 _TITLE = (
     "Lines that begin with `assumed` say what the log seemed to show.",
     "Lines that begin with `question` ask what only you know. Neither stops a command.",
@@ -261,8 +259,8 @@ def _shown_gains(first: FirstCase, log: LogLike, joints: Sequence[int]) -> dict[
     rough = rough_gains(session.machine, session.fit.data)
     if rough is None:
         return {}
-    found = zip(joints, rough.gains.tolist(), rough.std.tolist(), strict=True)
-    return {joint: gain for joint, gain, std in found if gain > 0 and std < _SHOWN * gain}
+    found = zip(joints, rough.gains.tolist(), rough.shown, strict=True)
+    return {joint: gain for joint, gain, shown in found if shown}
 
 
 def _robot(mjcf: str | Path | None, urdf: str | Path | None) -> Robot | None:

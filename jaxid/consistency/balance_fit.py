@@ -27,6 +27,8 @@ _FAR_GAIN = 3.0
 # Singular value, as a part of the largest, below which a direction of a rough fit is not identifiable, and
 # share of an unknown in it from which it is not either.
 _BLIND, _SHARE = 1e-9, 1e-3
+# Standard deviation of a gain, as a part of it, up to which a log shows it.
+_SHOWN = 0.05
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class BalanceFit:
         velocity: Velocity at the kept samples, (kept, n).
         counts: Mask of the samples that count, (kept, n).
         scale: Size of the force of each joint without its part that depends on position only, (n,).
-        gains: Joints whose drive has an unknown gain that the log may show, 0-based; see `rough_gains`.
+        gains: Joints whose drive has an unknown gain that the log shows, 0-based; see `rough_gains`.
     """
 
     unknowns: tuple[Free, ...]
@@ -105,10 +107,14 @@ class BalanceFit:
         Model minus gain times force is linear in the gain. A gain at a guess that is some per cent off hides
         a shift of the force in time.
         """
-        more = np.zeros((*self.force.shape, len(self.gains)))
+        columns = np.zeros((*self.force.shape, len(self.gains)))
         for k, joint in enumerate(self.gains):
-            more[:, joint, k] = self.force[:, joint]
-        return replace(self, potential=np.concatenate([self.potential, more], axis=2))
+            columns[:, joint, k] = self.force[:, joint]
+        return self.beside(columns)
+
+    def beside(self, columns: Float[np.ndarray, "kept n k"]) -> BalanceFit:
+        """Return the balance with more undeclared forces."""
+        return replace(self, potential=np.concatenate([self.potential, columns], axis=2))
 
     def rms(self, residual: np.ndarray) -> Float[np.ndarray, " n"]:
         """Return the RMS of a residual at the samples that count, by joint."""
@@ -169,6 +175,11 @@ class RoughGains(NamedTuple):
     def gains(self) -> np.ndarray:
         """Values of the gains, (k,)."""
         return self.values[self.places]
+
+    @property
+    def shown(self) -> Bool[np.ndarray, " k"]:
+        """Mask of the gains that the log shows, (k,). Joints that do not push each other show none."""
+        return (self.gains > 0) & (self.std < _SHOWN * self.gains)
 
 
 def rough_gains(machine: Machine, data: Prepared) -> RoughGains | None:
@@ -256,8 +267,8 @@ def balance_fits(
     velocity = np.asarray(data.recipe.decimator(data.qd))
     typical = np.abs(declared[1] * np.asarray(theta)[linear]).max(axis=2, initial=0.0)
     scale = _scales(force, potential, typical, data.fitted)
-    places_of_gains = _places_of_gains(machine, data)
-    gains = [] if places_of_gains is None else [machine.parameters.free[k] for k in places_of_gains]
+    rough = rough_gains(machine, data)
+    gains = [] if rough is None else [machine.parameters.free[k] for k in rough.places[rough.shown]]
     base = BalanceFit(
         unknowns=tuple(f for f, of in zip(machine.parameters.free, linear, strict=True) if of),
         columns=declared[1],

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -74,8 +72,7 @@ def clipped_force(
         # What the low-pass leaves of a force of one unit in the rows at an extreme.
         beyond_extreme = stands[side, :, k].astype(float) * machine.gain[k] * (1 - 2 * side)
         units[:, driven[k], i] = np.asarray(data.recipe.decimator(beyond_extreme[:, None]))[:, 0]
-    whole = with_friction(fit)
-    whole = replace(whole, potential=np.concatenate([whole.potential, -units], axis=2))
+    whole = with_friction(fit).beside(-units)
     missing, std = _last(whole, len(sides), data.recipe.independent)
     beyond = [(m, k, side) for m, s, (side, k) in zip(missing, std, sides, strict=True) if m > _CLEARLY * s]
     if not beyond:

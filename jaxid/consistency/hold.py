@@ -41,8 +41,8 @@ def better_hold(
     """Compare the force gaps under both holds.
 
     A held force acts half a sample later than its samples, one that is joined by lines does not. All
-    unknowns, forces of position, and a viscous and a Coulomb friction of every joint are fitted under both:
-    a friction that is missing acts as a shift in time does.
+    unknowns, gains of drives among them, forces of position, and a viscous and a Coulomb friction of every
+    joint are fitted under both: a friction that is missing acts as a shift in time does.
 
     Args:
         machine: The machine.
@@ -150,7 +150,7 @@ def with_friction(fit: BalanceFit) -> BalanceFit:
     for j in range(joints):
         more[:, j, 2 * j] = fit.velocity[:, j]
         more[:, j, 2 * j + 1] = np.sign(fit.velocity[:, j])
-    return replace(fit, potential=np.concatenate([fit.potential, more], axis=2))
+    return fit.beside(more)
 
 
 def hold_finding(log: Log, other: str, gaps: np.ndarray, unit: str, *, used: bool) -> Finding:

@@ -18,6 +18,8 @@ from jaxid.machine import Machine
 _TICKS = tuple(range(2, 11))
 # Gain in log-likelihood over a force that is held for a row, and over lines, from which a tick is taken.
 _EVIDENCE = 8.0
+# Part of a row below which a tick is not given as a number.
+_SHORT = 0.01
 
 
 class Tick(NamedTuple):
@@ -37,6 +39,8 @@ class Tick(NamedTuple):
     def finding(self, log: Log) -> Finding:
         """Return the note on it."""
         acts = f"each force seems to act for {1e3 * self.period:.2g} ms"
+        if self.period < _SHORT * log.period:
+            acts = "each force seems to act for a small part of a row"
         what = f"the loop is faster than the log: {acts}, and the log lacks the forces between its rows"
         return Finding("warning", what, f"{log.source}, force", "log every tick of the loop if you can")
 
@@ -44,8 +48,9 @@ class Tick(NamedTuple):
         """Return the entry of `settings` in result.json."""
         if self.evidence is None:
             reason = "the force answers to the noise of its own row's reading only, as that of a faster loop"
-            return {"value": f"{self.period:.3g} s", "reason": f"{reason}; known to {self.std:.2g} s"}
-        reason = f"it raises the log-likelihood by {self.evidence:.3g} over held forces and over lines"
+        else:
+            reason = f"it raises the log-likelihood by {self.evidence:.3g} over held forces and over lines"
+        reason = f"{reason}; standard deviation {self.std:.2g} s"
         return {"value": f"{self.period:.3g} s", "reason": reason}
 
 

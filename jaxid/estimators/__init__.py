@@ -28,6 +28,7 @@ from jaxid.estimators.needs import (
     need_no_profile,
     need_one_log,
 )
+from jaxid.estimators.uncertain_hold import with_uncertain_hold
 from jaxid.model.unknowns import in_loop
 from jaxid.names import USER_METHODS
 from jaxid.numerics.lanes import Steps
@@ -345,7 +346,8 @@ _FORMS = ("single_time", "ratio", "sign_changed", "sign_unchanged")
 
 # Methods that simulate, and accept options of the simulation.
 SIMULATING = ("output_error", "within_prior", "instrumental_variable", "didim")
-# Methods that solve balances of the measured force, which depend on the time for which each force acts.
+# Methods that solve balances of the measured force, and print what the uncertainty of the time for which each
+# force acts adds. `recursive` does not: its precision is that of its memory.
 BALANCING = ("inverse_dynamics", "instrumental_variable", "didim", "power", "algebraic")
 
 METHODS: dict[str, Callable[..., Steps[Estimate]]] = {
@@ -415,17 +417,17 @@ def steps_of(method: str, session: Session, **options: Any) -> Steps[Estimate]:
             "does not take them with several logs" if session.more else "does not simulate the loop with them"
         )
         need_known_controller(session, f"{method} {why}")
-    steps = METHODS[method]
-    if method in BALANCING and any(run.data.hold_std for run in session.fits):
-        from jaxid.estimators.uncertain_hold import with_uncertain_hold
-
-        steps = partial(with_uncertain_hold, METHODS[method])
-    if method != "within_prior":
+    if method == "within_prior":
+        steps = METHODS[method]
+    else:
         from jaxid.estimators.common.shapes import seen_shapes
 
         # A prior says something about every shape; other methods know what the log shows.
-        of_method, guess = steps, session.machine.parameters.guess
-        steps = lambda *args, **kwargs: seen_shapes(of_method(*args, **kwargs), guess)
+        steps = lambda *args, **kwargs: seen_shapes(
+            METHODS[method](*args, **kwargs), session.machine.parameters.guess
+        )
+    if method in BALANCING:
+        steps = partial(with_uncertain_hold, steps)
     if not session.case.identification.physically_consistent:
         return steps(session, **options)
     from jaxid.estimators.common.consistency import need_bodies, with_links

@@ -191,10 +191,6 @@ class Prepared:
     high_band: Float[np.ndarray, " m"] | None = None
     hold_std: float = 0.0
 
-    def with_longer_hold(self) -> Prepared:
-        """Return the log with each force held for one standard deviation longer."""
-        return replace(self, hold=self.hold + self.hold_std)
-
     @property
     def times(self) -> Float[np.ndarray, " kept"]:
         """Time of the kept samples from the start of the log [s]."""

@@ -84,9 +84,9 @@ def hold_against_case(case: Case, machine: Machine, opened: OpenedLog, free_hold
 
 
 class _Comparison:
-    """A log while it is held against its case.
+    """State of the comparison of a log with its case.
 
-    Each step adds its findings, and what it chooses holds in the next ones.
+    Each step adds findings. Later steps use what earlier ones chose.
     """
 
     def __init__(self, case: Case, machine: Machine, opened: OpenedLog) -> None:

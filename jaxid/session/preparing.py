@@ -41,7 +41,7 @@ def under_hold(hold: str, opened: OpenedLog, machine: Machine) -> OpenedLog:
     """Return a log under another hold of its force."""
     log = replace(opened.log, hold=hold)
     held = opened.data.recipe.hold(log, machine.hold_period)
-    return replace(opened, log=log, data=replace(opened.data, hold=held))
+    return replace(opened, log=log, data=replace(opened.data, hold=held, hold_std=0.0))
 
 
 def with_force_noise(opened: OpenedLog, noise: ForceNoise, tick: Tick | None = None) -> OpenedLog:

@@ -11,6 +11,7 @@ from jaxid.consistency import tick
 from jaxid.consistency.balance_fit import balance_fits
 from jaxid.consistency.noise import loop_is_faster
 from jaxid.estimators import METHODS, steps_of
+from jaxid.estimators.uncertain_hold import with_uncertain_hold
 from jaxid.numerics.lanes import run_alone
 from jaxid.session import Session, open_another, open_session
 from truth.axis.cases import case_text
@@ -120,18 +121,37 @@ def test_the_uncertainty_of_the_tick_is_an_error_of_the_values():
     fit = run_alone(steps_of("inverse_dynamics", session))
     longer = replace(session, fit=replace(session.fit, data=replace(data, hold=data.hold + data.hold_std)))
     known, other = (run_alone(METHODS["inverse_dynamics"](of)) for of in (session, longer))
+    change = other.theta - known.theta
     np.testing.assert_array_equal(fit.theta, known.theta)
-    np.testing.assert_allclose(fit.std, np.hypot(known.std, other.theta - known.theta), rtol=1e-9)
-    beside = fit.std_misspecified, known.std_misspecified
-    np.testing.assert_allclose(beside[0], np.hypot(beside[1], other.theta - known.theta), rtol=1e-9)
+    added = fit.precision.covariance - known.precision.covariance
+    np.testing.assert_allclose(added, np.outer(change, change), rtol=0.05)
+    np.testing.assert_allclose(fit.std_misspecified**2 - known.std_misspecified**2, change**2, rtol=0.05)
     assert np.max(fit.std / known.std) > 1.005
 
 
-def test_a_tick_that_is_known_adds_no_error():
-    session = opened(1)
-    assert session.fit.data.hold_std == 0.0
-    fit = run_alone(steps_of("inverse_dynamics", session))
-    np.testing.assert_array_equal(fit.std, run_alone(METHODS["inverse_dynamics"](session)).std)
+def test_a_known_time_is_not_fitted_twice():
+    session, calls = opened(1), []
+
+    def steps(of: Session):
+        calls.append(of.fit.data.hold)
+        return METHODS["inverse_dynamics"](of)
+
+    run_alone(with_uncertain_hold(steps, session))
+    assert calls == [1 / RATE]
+    known = replace(session.fit.data, hold_std=1e-5 / RATE)
+    run_alone(with_uncertain_hold(steps, replace(session, fit=replace(session.fit, data=known))))
+    assert len(calls) == 2
+
+
+def test_a_second_fit_that_fails_is_said():
+    session = opened(5)
+
+    def steps(of: Session):
+        fit = yield from METHODS["inverse_dynamics"](of)
+        return replace(fit, converged=of is session)
+
+    fit = run_alone(with_uncertain_hold(steps, session))
+    assert any("standard deviations are too small" in note for note in fit.notes)
 
 
 def test_lines_that_explain_far_more_leave_a_finite_tick(monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binom
 
 import jaxid
-from jaxid.consistency.balance_fit import rough_gains, with_rough_gains
+from jaxid.consistency.balance_fit import balance_fits, rough_gains, with_rough_gains
 from jaxid.results.verdict.robot_file import contradicted_file
 from truth.arm.two_links import TwoLinks, run_sampled
 from truth.axis.machines import multisine
@@ -208,6 +208,10 @@ def test_slides_that_do_not_push_each_other_show_no_ratio(tmp_path):
     rough = rough_gains(session.machine, session.fit.data)
     assert rough is not None
     assert not rough.std < 0.05 * rough.gains
+    assert not rough.shown.any()
+    # The force itself, as one more undeclared force, would explain its joint under every hold.
+    assert balance_fits(session.machine, session.fit.data)[0].gains == ()
+    assert "tick" not in session.settings
     assert first.tables["plant"]["units"] == {"force": "A"}
 
 
