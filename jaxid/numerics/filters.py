@@ -326,7 +326,9 @@ def _through(x: Array, pad: int, response: Callable[[np.ndarray], Array], every:
     return backwards(spectrum, few, axis=0)[first : first - (-n // every)]
 
 
-def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: float) -> Float[Array, "time m"]:
+def delayed(
+    u: Float[Array, "time m"], delay: Array, period: float, *, hold: float | Float[Array, ""]
+) -> Float[Array, "time m"]:
     """Return the mean force around each sample of a command that acts `delay` later.
 
     A held command acts from its sample on, so that at the samples its mean lags by half of the hold time.
@@ -343,8 +345,9 @@ def delayed(u: Float[Array, "time m"], delay: Array, period: float, *, hold: flo
     def response(f: np.ndarray) -> Array:
         # The mean of the held command over its hold time adds a lag and a roll-off. This is exact in the
         # band, while interpolation between samples is 1 % off at a sixth of the sampling rate.
-        lag = library(delay).exp(-2j * np.pi * f[:, None] * (delay + 0.5 * hold) / period)
-        return lag * np.sinc(f * hold / period)[:, None]
+        acts = delay + 0.5 * hold
+        xp = library(acts)
+        return xp.exp(-2j * np.pi * f[:, None] * acts / period) * xp.sinc(f * hold / period)[:, None]
 
     return _through(u, 200, response)
 

@@ -45,7 +45,7 @@ class ForceData(eqx.Module):
     weight: Float[Array, "kept n"]
     start: Float[Array, ""]
     period: float = eqx.field(static=True)
-    hold: float = eqx.field(static=True)
+    hold: Float[Array, ""]
     decimator: signals.Decimator = eqx.field(static=True)
     measured: tuple[bool, ...] = eqx.field(static=True, default=(True,))
     steps: int = eqx.field(static=True, default=1)
@@ -63,7 +63,7 @@ class ForceData(eqx.Module):
             weight=rows.astype(np.float64),
             start=np.asarray(data.start),
             period=data.period,
-            hold=data.hold,
+            hold=np.asarray(data.hold),
             decimator=data.recipe.decimator,
             measured=data.measured,
             steps=data.steps,

@@ -363,7 +363,7 @@ def _started(
     every = (True,) * arrays[0].shape[2]
 
     def one(theta: Array, lower: Array, upper: Array, arrays: _Motion) -> tuple:
-        data = ForceData(*arrays, jnp.zeros(()), period, level.hold, decimator, every)
+        data = ForceData(*arrays, jnp.zeros(()), period, np.asarray(level.hold), decimator, every)
 
         def balance(x: Array) -> Array:
             return (data.weight * force_residual(scatter(level.model_places, plant, x), data)).ravel()

@@ -1,4 +1,4 @@
-"""Course of the reference between the samples of a slow log, found from exact loops, and what it is worth."""
+"""Course of the reference between the samples of a slow log, found from exact loops, and its effect."""
 
 import dataclasses
 import tomllib
