@@ -31,16 +31,14 @@ from jaxid.discovery.superset import build_candidate_model, scales_of
 from jaxid.discovery.together import LEAST_AT_ONCE, add_together
 from jaxid.discovery.where import Where, locate
 from jaxid.errors import InputError, suggest
+from jaxid.estimators import METHODS
 from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.common.consistency import need_bodies, with_links
 from jaxid.estimators.common.minimisers import Minimiser, minimiser_of
 from jaxid.estimators.common.shapes import without_unseen_shapes
 from jaxid.estimators.effort import with_effort
 from jaxid.estimators.estimate import Estimate
-from jaxid.estimators.inverse_dynamics import inverse_dynamics_steps
 from jaxid.estimators.needs import need_force, need_known_controller, need_known_reference
-from jaxid.estimators.reading_noise import without_reading_noise
-from jaxid.estimators.several.force import inverse_dynamics_steps as inverse_dynamics_of_several
 from jaxid.estimators.several.parts import parts_of
 from jaxid.estimators.uncertain_hold import with_uncertain_hold
 from jaxid.gap import Gap, filter_floor, force_gap, gaps, noise_floor
@@ -49,7 +47,7 @@ from jaxid.logs.log import Log
 from jaxid.logs.prepare import Prepared
 from jaxid.machine import Machine
 from jaxid.numerics.coloured_noise import NoiseModel
-from jaxid.numerics.lanes import Steps, begin, run_alone
+from jaxid.numerics.lanes import begin, run_alone
 from jaxid.session import Logs, OpenedLog, Session, open_session
 from jaxid.session.holds import session_of_faster_loop, session_under_better_hold
 from jaxid.simulation.force_balance import ForceData
@@ -393,21 +391,13 @@ def _as_bodies_in_simulation(session: Session, start: Estimate, refit: bool) -> 
         known = session.machine.parameters.guess
         at = start.machine.with_estimate([*known, *start.theta[len(known) :]])
         bodies = need_bodies(session.with_machine(at))
-        start = run_alone(with_links(with_uncertain_hold(_of_force_steps, bodies), bodies))
+        start = run_alone(with_links(with_uncertain_hold(METHODS["inverse_dynamics"], bodies), bodies))
     return in_simulation(session, start, refit)
 
 
 def _of_force(session: Session) -> Estimate:
     """Return the estimate by inverse dynamics of one log or of several."""
-    return run_alone(with_uncertain_hold(_of_force_steps, session))
-
-
-def _of_force_steps(session: Session) -> Steps[Estimate]:
-    if session.more:
-        fit = inverse_dynamics_of_several(session.machine, parts_of(session))
-    else:
-        fit = inverse_dynamics_steps(session.machine, session.fit.data)
-    return (yield from without_reading_noise(session, (yield from fit)))
+    return run_alone(with_uncertain_hold(METHODS["inverse_dynamics"], session))
 
 
 def where_of(search: Search, baseline: Step, session: Session) -> Where:

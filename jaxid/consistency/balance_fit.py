@@ -112,6 +112,10 @@ class BalanceFit:
             columns[:, joint, k] = self.force[:, joint]
         return self.beside(columns)
 
+    def under_force(self, force: Float[np.ndarray, "kept n"]) -> BalanceFit:
+        """Return the balance under another declared force, through the same filter."""
+        return replace(self, known=self.known + self.force - force, force=force)
+
     def beside(self, columns: Float[np.ndarray, "kept n k"]) -> BalanceFit:
         """Return the balance with more undeclared forces."""
         return replace(self, potential=np.concatenate([self.potential, columns], axis=2))

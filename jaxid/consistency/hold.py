@@ -95,10 +95,8 @@ def residual_held(
         fit: Its balance.
         held: Time for which each force acts [s]; zero: lines join them.
     """
-    arrays = (ForceData.of(replace(data, hold=h)) for h in (data.hold, held))
-    now, then = (np.asarray(measured_force(machine.plant, a)) for a in arrays)
-    moved = replace(fit, known=fit.known + now - then, force=then)
-    return moved.with_gains().fit(bounded=False)[1]
+    force = np.asarray(measured_force(machine.plant, ForceData.of(replace(data, hold=held))))
+    return fit.under_force(force).with_gains().fit(bounded=False)[1]
 
 
 def clearly_better(

@@ -81,7 +81,6 @@ def compare_reference_holds(
     if len(commands) < len(laws):
         return ReferenceHold({}, None, "the declared law cannot be computed from the log alone")
 
-    logged = np.asarray(measured_force(machine.plant, ForceData.of(data)))
     wider = with_friction(fit)
     acting, residuals = {}, {}
     for hold, made in commands.items():
@@ -89,8 +88,7 @@ def compare_reference_holds(
         acting[hold] = np.asarray(
             measured_force(machine.plant, ForceData.of(replace(data, force=force, hold=0.0)))
         )
-        moved = replace(wider, known=wider.known + logged - acting[hold])
-        residuals[hold] = moved.fit(bounded=False)[1]
+        residuals[hold] = wider.under_force(acting[hold]).fit(bounded=False)[1]
     return _compared(machine, wider, acting, residuals)
 
 

@@ -18,7 +18,7 @@ from jaxid.machine import Machine
 _TICKS = tuple(range(2, 11))
 # Gain in log-likelihood over a force that is held for a row, and over lines, from which a tick is taken.
 _EVIDENCE = 8.0
-# Part of a row below which a tick is not given as a number.
+# Part of a row below which a tick, and part of a tick below which its deviation, is not given as a number.
 _SHORT = 0.01
 
 
@@ -50,7 +50,8 @@ class Tick(NamedTuple):
             reason = "the force answers to the noise of its own row's reading only, as that of a faster loop"
         else:
             reason = f"it raises the log-likelihood by {self.evidence:.3g} over held forces and over lines"
-        reason = f"{reason}; standard deviation {self.std:.2g} s"
+        if self.std > _SHORT * self.period:
+            reason = f"{reason}; standard deviation {self.std:.2g} s"
         return {"value": f"{self.period:.3g} s", "reason": reason}
 
 
