@@ -65,10 +65,12 @@ _LETTERS = {
 _OF_Q = re.compile(r"q[a-z]")
 # Phases of a motor, each of which has a current and a voltage.
 PHASES = frozenset("u v w".split())
-# Symbols of motor and load without a sign, as in thetam.
-_OF_SIDE = re.compile(r"(?i)\b(theta|th|phi|omega|w|tau)([ml])\b")
-# Letters of German drives behind which the role stands without a sign, as in Iist and n_soll.
-_WITH_ROLE = re.compile(r"(?i)\b([a-z])(ist|soll)\b")
+# Symbols of motor and load, as in thetam and thetaM, where M is no torque.
+_OF_SIDE = re.compile(r"(?i)\b(theta|th|phi|omega|w|tau)[ _]?([ml])\b")
+# Symbols behind which the role stands without a sign, as in Iist of German drives, qdes and thetaref.
+_WITH_ROLE = re.compile(
+    r"(?i)\b(?:([a-z])(ist|soll)|([qxyzsvwuin]|theta|th|phi|psi|tau|omega)(ref|des|cmd|act|meas))\b"
+)
 ROTARY = _TURNS | frozenset("winkel drehwinkel angle angles ang drehzahl omega rpm dof tau".split())
 LINEAR = frozenset("weg hub displacement hoehe height distance".split())
 # Units with a capital, which begins no word.
@@ -323,7 +325,8 @@ def _split(name: str) -> list[str]:
     """Split a name at signs, capitals and digits."""
     spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z]{2})", " ", name)
     spaced = re.sub(r"(?<=[A-Za-z])(?=\d)|(?<=\d)(?=[A-Za-z])", " ", spaced)
-    spaced = _OF_SIDE.sub(r"\1 \2", _WITH_ROLE.sub(r"\1 \2", spaced))
+    spaced = _WITH_ROLE.sub(lambda found: " ".join(filter(None, found.groups())), spaced)
+    spaced = _OF_SIDE.sub(lambda found: f"{found[1]} {found[2].lower()}", spaced)
     # A current or a voltage of the q axis may be split by its sign.
     spaced = re.sub(r"(?i)\b([iu])_q\b", r"\1q", spaced)
     return re.findall(r"[A-Za-z]+|\d+|%", spaced)
