@@ -29,7 +29,9 @@ FILE = Path(__file__).with_name("kinds.json")
 _OF_PLANTS = ("linked", "usual_motion", "passives", "tools", "actuated")
 _OF_EFFECTS = (
     "on_request",
+    "without_force",
     "without_force_on_request",
+    "break_away_level",
     "in_links",
     "adds_spring",
     "with_springs",

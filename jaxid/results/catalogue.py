@@ -27,15 +27,30 @@ def _table(registry: Mapping[str, type], noun: str) -> str:
     linear, rotary = Units("linear"), Units("rotary")
     rows = [[noun, "parameter", "sign", "linear", "rotary", "description"]]
     for kind, cls in registry.items():
-        asked = ""
-        if getattr(cls, "on_request", False):
-            asked = " `discover` searches for it on request."
-        elif getattr(cls, "in_links", False):
-            asked = " At an arm `discover` searches for it on request."
-        rows.append([kind, "", "", "", "", (cls.__doc__ or "").strip().splitlines()[0] + asked])
+        first = (cls.__doc__ or "").strip().splitlines()[0]
+        searched = _searched(cls) if noun == "effect" else ""
+        rows.append([kind, "", "", "", "", f"{first} {searched}".strip()])
         for name, info in parameters_of(cls).items():
             shown = f"{name}?" if info.optional else name
             units = [either.label(info.dimension, info.motion) for either in (linear, rotary)]
             rows.append(["", shown, SIGNS[info.sign], *units, info.doc])
     note = "\n? : optional, such as a parameter that replaces another"
     return aligned(rows) + (note if any(r[1].endswith("?") for r in rows) else "")
+
+
+def _searched(cls: type) -> str:
+    """Return the sentence on when `discover` searches for an effect; empty if it always does."""
+    with_force, without_force = not getattr(cls, "on_request", False), getattr(cls, "without_force", False)
+    if with_force and getattr(cls, "break_away_level", None) is not None:
+        return "Without a force `discover` does not search for it."
+    if with_force and not without_force:
+        return "Without a force `discover` searches for it on request."
+    if with_force and getattr(cls, "adds_spring", False):
+        return "At an arm without a force `discover` searches for it on request."
+    if with_force and getattr(cls, "in_links", False):
+        return "At an arm `discover` searches for it on request."
+    if with_force:
+        return ""
+    if without_force:
+        return "`discover` searches for it without a force; with one, on request."
+    return "`discover` searches for it on request."
