@@ -14,7 +14,11 @@ from jaxid.commands.discover import discover
 from jaxid.commands.init import init
 from jaxid.commands.robot_case import RobotCase, implied_case, let_go
 from jaxid.errors import InputError
-from jaxid.results.verdict.robot_file import contradicted_file
+from jaxid.results.as_json import identification_json
+from jaxid.results.as_text import parameter_rows
+from jaxid.results.report.build import identification_data
+from jaxid.results.report.numbers import plain
+from jaxid.results.verdict.robot_file import contradicted_file, values_of_file
 from jaxid.session import open_session
 from tests.export.test_replayed import SERVOS, TRUE, logged, text
 from tests.support.cli_setup import run
@@ -72,13 +76,25 @@ def test_values_of_the_file_that_the_log_contradicts_are_listed(folder):
         off = abs(p[name].value - p[name].guess) > max(3 * p[name].std, 0.01 * p[name].value)
         assert off == (f"{name} = " in line), name
         assert f"({p[name].guess:g} in the file)" in line
+    # They stand beside the values that were found, wherever these are shown.
+    head, *rows = parameter_rows(found)
+    at = head.index("in robot.xml")
+    assert {row[0]: row[at] for row in rows} == {n: plain(v.guess) for n, v in p.items()}
+    listed = identification_json(found)["parameters"]
+    assert listed["coulomb_friction[1].level"]["in_file"] == p["coulomb_friction[1].level"].guess
+    moments = [p[f"first_moment_x[{k}]"].guess for k in (1, 2)]
+    assert listed["first_moment_x"]["in_file"] == pytest.approx(moments)
+    [shown] = [r for r in identification_data(found).parameters if r.name == "first_moment_x[1]"]
+    assert shown.in_file == pytest.approx(moments[0])
     # A value of the case itself is none of the file's.
     tables = implied_case(folder / "robot.xml", folder / "log.csv")
     tables["plant"]["mjcf"] = str(folder / "robot.xml")
     tables["plant"]["unknown"] = ["base", "armature", "damping"]
     tables["effects"] = [{"kind": "coulomb_friction", "level": {"guess": [3.0, 3.0]}}]
-    [line] = contradicted_file(open_session(tables, folder / "log.csv"), found.estimate)
+    session = open_session(tables, folder / "log.csv")
+    [line] = contradicted_file(session, found.estimate)
     assert "coulomb_friction[1].level = " not in line
+    assert "coulomb_friction[1].level" not in values_of_file(session)
 
     (folder / "robot.xml").write_text(text(**TRUE))
     right = open_session(implied_case(folder / "robot.xml", folder / "log.csv"), folder / "log.csv")

@@ -53,6 +53,4 @@ def _findings(result: FitResult) -> str:
 
 
 def _parameters(result: FitResult, caption: str) -> str:
-    derived = as_json.derived(result.session, result.estimate)
-    incomplete = result.model_complete is False
-    return html_table(as_text.parameter_rows(result.estimate, derived, incomplete=incomplete), caption)
+    return html_table(as_text.parameter_rows(result), caption)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from jaxid.results.found_case import case_text, changed_in_python
 from jaxid.results.model_json import joint_name, model_json
 from jaxid.results.parameters import Covariance
 from jaxid.results.proposals import proposal_json
+from jaxid.results.verdict.robot_file import values_of_file
 
 if TYPE_CHECKING:
     from jaxid.commands.identify import Identification
@@ -33,7 +34,11 @@ from jaxid.simulation.sensor_noise import position_noise
 
 
 def parameters_json(
-    estimate: Estimate, names: Sequence[str] | None = None, *, incomplete: bool = False
+    estimate: Estimate,
+    names: Sequence[str] | None = None,
+    *,
+    incomplete: bool = False,
+    of_file: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Return value, standard deviation, unit and identifiability by name, and plant lists as lists.
 
@@ -41,6 +46,8 @@ def parameters_json(
         estimate: The estimate.
         names: Names of the parameters to return; None: all.
         incomplete: Whether the model is incomplete, so that the deviations that hold then stand beside.
+        of_file: Values of a robot's file by name, which stand beside as `in_file`; None or empty: there are
+            none.
     """
     out: dict[str, Any] = {}
     plant = estimate.machine.plant
@@ -66,17 +73,25 @@ def parameters_json(
             "unit": f.unit,
             "identifiable": bool(identifiable),
             **{key: float(s[k]) if identifiable and np.isfinite(s[k]) else None for key, s in more.items()},
+            **({"in_file": of_file[f.name]} if of_file and f.name in of_file else {}),
         }
         if f.index is None or in_loop(f.path):
             out[f.name] = entry
             continue
         listed = out.setdefault(_key(f), _known(np.asarray(leaf(plant, f.path)), f.unit))
-        for key in more:
+        beside = [key for key in entry if key in (*more, "in_file")]
+        for key in beside:
             listed.setdefault(key, np.full(np.shape(listed["value"]), None).tolist())
-        for key in ("value", "std", "identifiable", *more):
+        for key in ("value", "std", "identifiable", *beside):
             *row, at = np.atleast_1d(f.index)
             (listed[key][row[0]] if row else listed[key])[at] = entry[key]
     return out
+
+
+def _parameters_json(result: FitResult) -> dict[str, Any]:
+    """Return all parameters of a result, with the values of the robot's file beside them."""
+    incomplete = result.model_complete is False
+    return parameters_json(result.estimate, incomplete=incomplete, of_file=values_of_file(result.session))
 
 
 def _add_of_log(out: dict[str, Any], f: Free, value: float, std: float, identifiable: bool) -> None:
@@ -237,7 +252,7 @@ def identification_json(result: Identification) -> dict[str, Any]:
         "message": estimate.message,
         **judgement_json(result),
         "samples": estimate.samples,
-        "parameters": parameters_json(estimate, incomplete=result.model_complete is False),
+        "parameters": _parameters_json(result),
         **derived_json(result.session, estimate),
         "covariance": covariance_of(estimate).json(),
         "unidentifiable": [{"combination": c} for c in estimate.precision.unidentifiable],
@@ -376,11 +391,7 @@ def discovery_json(result: Discovery) -> dict[str, Any]:
             "simulation": motion,
         },
         **({"joints": joints_json(result, motion)} if result.joints else {}),
-        "parameters": {
-            k: v
-            for k, v in parameters_json(result.after, incomplete=result.model_complete is False).items()
-            if k in declared
-        },
+        "parameters": {k: v for k, v in _parameters_json(result).items() if k in declared},
         **derived_json(result.session, result.after),
         "covariance": covariance_of(result.after).json(),
         **model_json(result.session, result.after),

@@ -15,14 +15,14 @@ from jaxid.results.by_joint import joint_rows
 from jaxid.results.notes import grouped_notes
 from jaxid.results.parameters import lines_of
 from jaxid.results.precision import precision_lines, ratio_rows
-from jaxid.results.report.numbers import with_std
+from jaxid.results.report.numbers import plain, with_std
 from jaxid.results.report.words import SLIGHT, place_words, within_prior_words
+from jaxid.results.verdict.robot_file import file_of, values_of_file
 
 if TYPE_CHECKING:
     from jaxid.commands.check import Check
     from jaxid.commands.identify import Identification
     from jaxid.discovery.result import Discovery
-    from jaxid.estimators.common.derived import Derived
     from jaxid.estimators.estimate import Estimate
     from jaxid.gap import Gap
     from jaxid.machine import Machine
@@ -49,23 +49,28 @@ _EVIDENCE_WORDS = (
 )
 
 
-def parameter_rows(
-    estimate: Estimate, derived: Sequence[Derived] = (), *, incomplete: bool = False
-) -> list[list[str]]:
+def parameter_rows(result: FitResult) -> list[list[str]]:
     """Return a header, and value, standard deviation and unit of every parameter and derived quantity.
 
-    With an incomplete model the deviations that hold then stand in a column of their own.
+    With an incomplete model the deviations that hold then stand in a column, and so do the values of the
+    robot's file, where there is one.
     """
-    beside = estimate.std_misspecified if incomplete else None
-    rows = [["parameter", "value", "std", *([] if beside is None else [INCOMPLETE]), "unit"]]
+    session, estimate = result.session, result.estimate
+    beside = estimate.std_misspecified if result.model_complete is False else None
+    of_file = values_of_file(session)
+    heads = [] if beside is None else [INCOMPLETE]
+    heads += [f"in {file_of(session)}"] if of_file else []
+    rows = [["parameter", "value", "std", *heads, "unit"]]
     free = estimate.machine.parameters.free
     for k, f in enumerate(free):
         value, std, ok = estimate.theta[k], estimate.std[k], estimate.identifiable[k]
         shown = with_std(value, std) if ok else ("-", UNIDENTIFIABLE)
         more = [] if beside is None else [with_std(value, beside[k])[1] if ok else "-"]
+        if of_file:
+            more.append(plain(of_file[f.name]) if f.name in of_file else "-")
         rows.append([f.name, *shown, *more, f.unit])
-    more = [] if beside is None else ["-"]
-    rows += [[d.name, *with_std(d.value, d.std), *more, d.unit] for d in derived if np.isfinite(d.std)]
+    derived = [d for d in results.derived(session, estimate) if np.isfinite(d.std)]
+    rows += [[d.name, *with_std(d.value, d.std), *("-" for _ in heads), d.unit] for d in derived]
     return rows
 
 
@@ -105,9 +110,7 @@ def logs_rows(session: Session, gaps: Sequence[Gap], floor: np.ndarray) -> list[
 
 def _parameters_text(result: FitResult) -> str:
     """Return the table of parameters, with a line below it if the model is incomplete."""
-    derived = results.derived(result.session, result.estimate)
-    incomplete = result.model_complete is False
-    rows = parameter_rows(result.estimate, derived, incomplete=incomplete)
+    rows = parameter_rows(result)
     return aligned(rows) + (f"\n{_INCOMPLETE_WORDS}" if INCOMPLETE in rows[0] else "")
 
 

@@ -30,6 +30,7 @@ from jaxid.results.report.data import (
     WherePlot,
 )
 from jaxid.results.run_facts import run_facts
+from jaxid.results.verdict.robot_file import values_of_file
 
 if TYPE_CHECKING:
     from jaxid.commands.identify import Identification
@@ -147,7 +148,7 @@ def _common(result: Identification | Discovery, notes: Sequence[str], command: s
     return {
         "case_name": session.case.name,
         "log_name": ", ".join(dict.fromkeys(Path(run.log.source).name for run in session.fits)),
-        "parameters": _rows(estimate, incomplete=incomplete),
+        "parameters": _rows(session, estimate, incomplete=incomplete),
         "precision": precision_content(estimate),
         "derived": _derived(session, estimate),
         "units": units_of(session),
@@ -188,15 +189,15 @@ def _units_at(session: Session, joint: int) -> dict[str, str]:
     }
 
 
-def _rows(estimate: Estimate, *, incomplete: bool) -> tuple[ParameterRow, ...]:
+def _rows(session: Session, estimate: Estimate, *, incomplete: bool) -> tuple[ParameterRow, ...]:
     """Return the parameters; of an incomplete model with the deviations that hold for it."""
-    beside = estimate.std_misspecified if incomplete else None
+    beside, of_file = estimate.std_misspecified if incomplete else None, values_of_file(session)
     out = []
     for k, f in enumerate(estimate.machine.parameters.free):
         ok = bool(estimate.identifiable[k])
         value, std = (float(x[k]) if ok else None for x in (estimate.theta, estimate.std))
         more = None if beside is None or not ok or not np.isfinite(beside[k]) else float(beside[k])
-        out.append(ParameterRow(f.name, value, std, f.unit, ok, more))
+        out.append(ParameterRow(f.name, value, std, f.unit, ok, more, of_file.get(f.name)))
     return tuple(out)
 
 

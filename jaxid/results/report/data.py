@@ -94,7 +94,8 @@ class SearchStep:
 class ParameterRow:
     """One parameter; `value` and `std` are None if it is not identifiable.
 
-    `std_misspecified` is the deviation that holds for an incomplete model; None: not shown.
+    `std_misspecified` is the deviation that holds for an incomplete model; None: not shown. `in_file` is the
+    value in the robot's file; None: there is none.
     """
 
     name: str
@@ -103,6 +104,7 @@ class ParameterRow:
     unit: str
     identifiable: bool = True
     std_misspecified: float | None = None
+    in_file: float | None = None
 
 
 class WherePlot(NamedTuple):

@@ -484,6 +484,7 @@ def _parameter_line(row: ParameterRow) -> dict:
         "interval": _interval(row, scale) if row.identifiable else ABSENT,
         "relative": _relative(row.std, row.value) if row.identifiable else ABSENT,
         "misspecified": _misspecified(row, scale),
+        "in_file": None if row.in_file is None else plain(row.in_file / scale),
         "unit": unit,
         "identifiable": row.identifiable and is_number(row.value),
         "vague": not (is_number(row.value) and is_number(row.std) and row.std < _VAGUE * abs(row.value)),

@@ -19,6 +19,22 @@ _STDS, _PART = 3.0, 0.01
 _MOST = 8
 
 
+def file_of(session: Session) -> str:
+    """Return the name of the robot's file whose values are guesses of unknowns; empty if there is none."""
+    plant = session.case.tables.get("plant", {})
+    file = plant.get("mjcf") or plant.get("urdf")
+    if not file or "force" in plant.get("units", {}):
+        return ""  # a file is in kg and N m, and says nothing about values in A
+    return Path(str(file)).name
+
+
+def values_of_file(session: Session) -> dict[str, float]:
+    """Return the values of a robot's file that are unknowns of a fit, by name of the unknown."""
+    if not file_of(session):
+        return {}
+    return {f.name: f.guess for f in session.machine.parameters.free if _from_file(f, session.case)}
+
+
 def contradicted_file(session: Session, estimate: Estimate) -> list[str]:
     """Return a sentence on the values of a robot's file that a fit contradicts.
 
@@ -28,11 +44,7 @@ def contradicted_file(session: Session, estimate: Estimate) -> list[str]:
         session: Case and logs; the unknowns of its machine have the guesses.
         estimate: Parameters and their precision.
     """
-    plant = session.case.tables.get("plant", {})
-    file = plant.get("mjcf") or plant.get("urdf")
-    if not file or "force" in plant.get("units", {}):
-        return []  # a file is in kg and N m, and says nothing about values in A
-    of_file = {f.name: f.guess for f in session.machine.parameters.free if _from_file(f, session.case)}
+    of_file = values_of_file(session)
     std = estimate.std if estimate.std_misspecified is None else estimate.std_misspecified
     spread = np.fmax(estimate.std, std)
 
@@ -51,7 +63,7 @@ def contradicted_file(session: Session, estimate: Estimate) -> list[str]:
         return []
     listed = [text for _, text in sorted(off, key=lambda entry: -entry[0])]
     more = f"; and {len(listed) - _MOST} more" if len(listed) > _MOST else ""
-    head = f"{len(off)} of {compared} values are not those of {Path(str(file)).name}"
+    head = f"{len(off)} of {compared} values are not those of {file_of(session)}"
     return [f"{head}: {'; '.join(listed[:_MOST])}{more}."]
 
 
