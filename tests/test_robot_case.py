@@ -69,6 +69,10 @@ def test_python_takes_a_robots_file_for_a_case_too(folder, of):
 def test_values_of_the_file_that_the_log_contradicts_are_listed(folder):
     """The log is of a robot with other friction; against its own file it contradicts nothing."""
     found = jaxid.identify(folder / "robot.xml", folder / "log.csv", method="inverse_dynamics")
+    assert found.model_complete
+    first = found.findings[0]
+    assert first.startswith("The model is complete for this log: the force gap of ")
+    assert first.endswith(" that filtering and integration may leave.")
     [line] = [f for f in found.judgement.findings if "robot.xml" in f]
     assert "values are not those of robot.xml: " in line
     p = found.parameters

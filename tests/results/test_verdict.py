@@ -19,6 +19,7 @@ from jaxid.results.as_text import verdict_line
 from jaxid.results.verdict import judge
 from jaxid.results.verdict.absurd import remarks_on
 from jaxid.results.verdict.completeness import (
+    Residual,
     cumulated_excess,
     position_residuals,
     residuals_of,
@@ -183,6 +184,26 @@ def test_a_complete_model_says_so(complete):
     assert complete.findings[0] == (
         "The model is complete for this log: what it leaves has the size and colour of noise."
     )
+
+
+# A residual of twice the noise that follows the motion, within the errors of filtering.
+SMALL = Residual("log", 0, True, rms=2.0, floor=1.0, excess=0.5, limit=0.1, systematic=1.7, numerics=3.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "within"),
+    [
+        ({}, True),
+        ({"excess": 0.0}, True),
+        ({"numerics": 1.8}, True),
+        ({"rms": 1.2}, False),
+        ({"floor": np.nan}, False),
+        ({"complete": False}, False),
+        ({"excess": 0.0, "numerics": 1.8}, False),
+    ],
+)
+def test_more_than_noise_is_not_called_noise(changed, within):
+    assert replace(SMALL, **changed).within_numerics == within
 
 
 def test_files_and_report_say_the_same(missing, complete, tmp_path):

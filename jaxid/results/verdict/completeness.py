@@ -93,6 +93,12 @@ class Residual:
         """True if the residual has clearly more power at low frequencies than the noise."""
         return self.excess > self.limit and self.systematic > self.numerics
 
+    @property
+    def within_numerics(self) -> bool:
+        """True if it passes for complete, but is more than noise: errors of filtering may be as large."""
+        small = self.rms <= self.numerics or self.excess > self.limit
+        return self.complete is True and small and self.rms > _LOUDER * self.floor
+
 
 def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: bool = True) -> list[Residual]:
     """Compare the force residual of each joint that moves with the sensors' noise.

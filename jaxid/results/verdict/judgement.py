@@ -327,10 +327,11 @@ def _completeness_words(
     """
     if complete:
         with_it = "With what was found the" if search == "found" else "The"
-        return [
-            f"{with_it} model is complete for this log: what it leaves has the size and colour of noise.",
-            *_noise_words(session, residuals),
-        ]
+        left = max((r for r in residuals if r.within_numerics), key=_severity, default=None)
+        what = "what it leaves has the size and colour of noise"
+        if left is not None:
+            what = f"{_residual_words(session, left)}, but no more than {_numerics_words(session, left)}"
+        return [f"{with_it} model is complete for this log: {what}.", *_noise_words(session, residuals)]
     if complete is None:
         reason = next((r.reason for r in residuals if r.complete is None), doubt)
         unexplained = not reason and search == "nothing_missing"
@@ -390,6 +391,12 @@ def _loop_words(session: Session) -> list[str]:
         f"The log has a reference, and the case no [controller]{named}: {faster}, its force changes between "
         "the rows, and only a declared loop with its period gives it."
     ]
+
+
+def _numerics_words(session: Session, r: Residual) -> str:
+    """Return in words how large the errors of filtering and integration in a residual may be."""
+    scale, unit = scaled_unit(session.machine.unit(r.quantity, r.joint), [r.numerics])
+    return f"the {plain(r.numerics / scale)} {unit} that filtering and integration may leave"
 
 
 def _severity(r: Residual) -> float:
