@@ -14,6 +14,7 @@ from jaxid.discovery.in_loop import unforced
 from jaxid.discovery.in_loop.afar import FEW
 from jaxid.discovery.in_loop.positions import LoopAcceptance, PositionDomain
 from jaxid.errors import InputError
+from jaxid.results.as_json import turned_down
 from jaxid.session import open_session
 from tests.estimators.test_unforced import CASE, DELAY, FREE, TRUE, log
 from truth.axis.machines import Setup, moves, multisine
@@ -155,13 +156,25 @@ def test_a_hidden_effect_is_named_with_its_values(kind):
 
 
 @pytest.mark.slow
-def test_another_log_confirms_or_refuses():
-    """The validation log of a machine without the effect does not confirm it."""
+def test_another_log_confirms():
     text = CASE.replace(COULOMB, "")
     confirmed = searched(text, log(), validate=[log(seed=3)])
     assert confirmed.kinds == ["coulomb_friction"]
     assert confirmed.rounds[-1].position_validation[0] < 6e-4
     assert DELAY == pytest.approx(confirmed.parameters["controller.delay"].value, abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rubs", [True, False])
+def test_the_log_of_a_machine_without_the_effect_refuses_it(rubs):
+    text = without(CASE, "delay = { guess = 0.005 }\n", COULOMB)
+    friction = {"coulomb_friction": {"level": 0.03}}
+    other = short(friction if rubs else {}, seed=3)
+    d = searched(text, short(friction), ("coulomb_friction",), validate=[other])
+    assert d.kinds == (["coulomb_friction"] if rubs else [])
+    refused = "coulomb_friction was not added" in " ".join(turned_down(d))
+    assert refused == (not rubs)
+    assert d.verdict == ("found" if rubs else "unexplained")
 
 
 @pytest.mark.slow
