@@ -1,5 +1,6 @@
 """Experiments for a servo whose log holds command and encoder alone, held against an exact machine."""
 
+import dataclasses
 import tomllib
 
 import numpy as np
@@ -9,6 +10,7 @@ import jaxid
 from benchmarks.unforced_machines import COUNT, NOISE, Servo
 from jaxid.cli import main
 from jaxid.errors import InputError
+from tests.support.written_logs import write_csv
 
 RATE, EVERY, SECONDS = 250.0, 5, 4.0
 TRUE = {
@@ -130,6 +132,29 @@ def test_the_files_give_the_scale_that_no_motion_tells(tmp_path, capsys):
         parameter = result.parameters[name]
         assert abs(parameter.value - true) < 4 * parameter.std, name
         assert parameter.std < 0.1 * true, name
+
+
+@pytest.mark.slow
+def test_second_logs_with_another_gain_scatter_as_expected(found, tmp_path):
+    """Of 4 pairs of logs, the second with another gain."""
+    gains = {log.values["controller.kp"]: log.std for log in found.second if "controller.kp" in log.values}
+    assert gains
+    assert set(gains) <= {KP / 2, 2 * KP}
+    gain, expected = max(gains.items())
+    # The same log a second time would leave 0.25.
+    assert np.prod(expected / found.std) < 0.2
+    case, squares = tomllib.loads(CASE), []
+    for seed in range(4):
+        entries = []
+        for name, kp in ((f"{seed}_stated", KP), (f"{seed}_other", gain)):
+            drawn = dataclasses.replace(servo(found.values[:, 0], seed=10 * seed + len(entries)), kp=kp)
+            write_csv(tmp_path / f"{name}.csv", drawn.columns())
+            entries.append({"name": name, "log": str(tmp_path / f"{name}.csv")})
+        entries[1]["set"] = {"controller.kp": gain}
+        estimate = jaxid.identify({**case, "fit": entries}).estimate
+        assert estimate.converged
+        squares.append(((estimate.theta - np.array(list(TRUE.values()))) / expected) ** 2)
+    assert 0.5 < np.sqrt(np.mean(squares)) < 1.7, np.sqrt(np.mean(squares, axis=0))
 
 
 @pytest.mark.slow
