@@ -29,7 +29,11 @@ _LONGEST = 0.1
 
 
 def coarse_starts(
-    machine: Machine, parts: Sequence[Part], numerics: Sequence[Numerics], count: int = 3
+    machine: Machine,
+    parts: Sequence[Part],
+    numerics: Sequence[Numerics],
+    count: int = 3,
+    ratios: Sequence[str] = (),
 ) -> list[Float[np.ndarray, " p"]]:
     """Return starts of a fit: the guesses, and the best of many points about them in simulation.
 
@@ -43,8 +47,10 @@ def coarse_starts(
         parts: The logs.
         numerics: Settings of the integration of each.
         count: Number of points beside the guesses.
+        ratios: Names of unknowns that count relative to one that is held, so that the errors of two guesses
+            are in them. They vary by the square of the factor.
     """
-    points = points_about(machine)
+    points = points_about(machine, ratios=ratios)
     if points is None:
         return [machine.parameters.guess]
     if len(parts) == 1:
@@ -63,8 +69,15 @@ def coarse_starts(
     return list(kept[np.argsort(costs, kind="stable")[: count + 1]])
 
 
-def points_about(machine: Machine, count: int = _POINTS) -> Float[np.ndarray, "points p"] | None:
-    """Return the guesses and so many points about them; None if no unknown moves."""
+def points_about(
+    machine: Machine, count: int = _POINTS, ratios: Sequence[str] = ()
+) -> Float[np.ndarray, "points p"] | None:
+    """Return the guesses and so many points about them; None if no unknown moves.
+
+    Args:
+        machine, ratios: As in `coarse_starts`.
+        count: Number of points, a power of two.
+    """
     unknown = machine.parameters
     guess, (lower, upper) = unknown.guess, unknown.bounds
     delays = np.array([f.path[0] == CONTROLLER and f.path[1] == "delay" for f in unknown.free])
@@ -77,7 +90,8 @@ def points_about(machine: Machine, count: int = _POINTS) -> Float[np.ndarray, "p
     for k in np.flatnonzero(moved):
         own = draws[:, names.index(unknown.free[k].parameter)]
         longest = max(_SPREAD * guess[k], _LONGEST)
-        points[:, k] = longest * own if delays[k] else guess[k] * _SPREAD ** (2 * own - 1)
+        spread = _SPREAD**2 if unknown.free[k].name in ratios else _SPREAD
+        points[:, k] = longest * own if delays[k] else guess[k] * spread ** (2 * own - 1)
     return np.concatenate([guess[None], np.clip(points, lower, upper)])
 
 

@@ -7,12 +7,13 @@ the others are given relative to it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxid.consistency.absent import without_scale
 from jaxid.controllers.linear import PD, PID, CascadePD
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 
 # Starts from which logs that are fitted together are fitted; each fit simulates all of them many times.
 _STARTS_TOGETHER = 2
+# Factor in RMS over the noise beyond which a fit without a scale is tried from starts that are further away.
+_FAR = 2.0
 # Keys of each law that give its command a scale; without one that is known, the scale is free.
 _GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
 
@@ -119,10 +122,14 @@ def _fitted_steps(
     if len(parts) > 1:
         starts = starts[:_STARTS_TOGETHER]
     fit = output_error_steps if by_joints is None or without_noise else whole_steps
-    fits = []
-    for start in starts:
-        fits.append((yield from fit(fitted, parts, start=start, numerics=numerics, **options)))
-    result = min(fits, key=lambda e: (not e.converged, misfit(e)))
+    fit = partial(fit, fitted, parts, numerics=numerics, **options)
+    result = yield from _best_of(fit, starts)
+    if base is not None and by_joints is None and _leaves_more_than_noise(result, parts):
+        ratios = [name for k, name in enumerate(machine.parameters.names) if k in group and k != base]
+        others = coarse_starts(fitted, parts, chosen, ratios=ratios)
+        others = [start for start in others if not np.array_equal(start, fitted.parameters.guess)]
+        again = yield from _best_of(fit, others[: _STARTS_TOGETHER if len(parts) > 1 else None])
+        result = min(result, again, key=_order)
     if result.converged and by_joints is None and not without_noise:
         result = yield from _by_mean_readings(fitted, parts, result, numerics=numerics, **options)
     if base is None:
@@ -131,6 +138,29 @@ def _fitted_steps(
     if scale is not None:
         return with_known_scale(result, machine, group, base, scale)
     return with_free_scale(result, machine, group, base)
+
+
+def _best_of(
+    fit: Callable[..., Steps[Estimate]], starts: Sequence[Float[np.ndarray, " p"]]
+) -> Steps[Estimate]:
+    """Return the best fit from several starts."""
+    fits = []
+    for start in starts:
+        fits.append((yield from fit(start=start)))
+    return min(fits, key=_order)
+
+
+def _order(estimate: Estimate) -> tuple[bool, float]:
+    """Return a key by which fits of the same logs compare, the least one that of the best fit."""
+    return not estimate.converged, misfit(estimate)
+
+
+def _leaves_more_than_noise(estimate: Estimate, parts: Sequence[Part]) -> bool:
+    """Check that a fit leaves clearly more of the positions than the noise of their encoders."""
+    counted = np.maximum(np.isfinite(estimate.residual).sum(axis=0), 1)
+    left = np.sqrt(np.nansum(np.square(estimate.residual), axis=0) / counted)
+    noise = np.max([position_noise(part.machine, part.log) for part in parts], axis=0)
+    return bool(np.any(left > _FAR * noise))
 
 
 def _by_mean_readings(

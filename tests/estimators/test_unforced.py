@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import jaxid
+from benchmarks import unforced_starts
 from benchmarks.unforced import covered, of
+from benchmarks.unforced_machines import servo
 from jaxid.errors import InputError
 from jaxid.session import open_session
 from truth.axis.machines import Setup, moves, multisine
@@ -108,6 +110,20 @@ def test_guesses_five_times_off_lead_to_the_same_optimum():
     for name, true in TRUE.items():
         found = result.parameters[name]
         assert abs(found.value - true) < 4 * found.std, name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [0, 9])
+def test_ratios_are_found_from_guesses_that_are_off_in_opposite_directions(start):
+    """The inertia is held at a fifth of its value, and gains and friction start from five times theirs."""
+    found = unforced_starts.ran(1, start)
+    assert not found["known"]
+    assert found["converged"]
+    assert found["left"] < 6e-4
+    true = servo(unforced_starts.FIRST + 1).truth()
+    for name in ("controller.kp", "controller.kd", "viscous_friction.coefficient", "coulomb_friction.level"):
+        value, std = found["values"][f"{name} / inertia"]
+        assert abs(value - true[name] / true["inertia"]) < 4 * std, name
 
 
 @pytest.mark.slow
