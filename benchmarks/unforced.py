@@ -1,12 +1,14 @@
 """Logs of servos and of arms without a force, by the exact stepper: what `identify` and `discover` find.
 
     python -m benchmarks.unforced [--coverage N] [--hidden N] [--nulls N] [--arm-hidden N] [--arm-nulls N]
-                                  [--arm-coverage N] [--arm-elastic N] [--first N] [--seconds S] [-o DIR]
+                                  [--arm-coverage N] [--arm-elastic N] [--fine-hidden N] [--fine-nulls N]
+                                  [--first N] [--seconds S] [-o DIR]
 
 Coverage: the share of 95 % intervals that hold the truth, from guesses up to three times off, and for arms
 two to five times off. Hidden: one effect that the case does not declare, with what an oracle sees of it; on
 an arm of two joints it acts at one of them. Elastic: arms with a spring at one joint, for which the case
-asks. Nulls: complete cases, in which nothing should be named. The runs of a part have the numbers from
+asks. Fine: servos with an encoder of 16 000 counts, delays up to 0.1 s and no known gain. Nulls: complete
+cases, in which nothing should be named. The runs of a part have the numbers from
 --first (0) to below N. They are written to DIR/unforced.jsonl as they end; a second call goes on from there,
 and rewrites DIR/unforced.md from all of them. --seconds ends a call after so much time.
 """
@@ -32,10 +34,10 @@ from benchmarks.unforced_table import table
 HERE = Path(__file__).parent / "results"
 # First seeds of the parts: no machine is in two of them.
 FIRST = {"coverage": 0, "hidden": 10_000, "nulls": 20_000, "arm_hidden": 30_000, "arm_nulls": 40_000}
-FIRST |= {"arm_coverage": 50_000, "arm_elastic": 60_000}
+FIRST |= {"arm_coverage": 50_000, "arm_elastic": 60_000, "fine_hidden": 80_000, "fine_nulls": 90_000}
 RUNS = {"coverage": 40, "hidden": 40, "nulls": 40, "arm_hidden": 16, "arm_nulls": 8, "arm_coverage": 12}
 # A search for springs takes many minutes.
-RUNS |= {"arm_elastic": 0}
+RUNS |= {"arm_elastic": 0, "fine_hidden": 0, "fine_nulls": 0}
 
 
 def of(part: str, number: int) -> Servo | Arm:
@@ -50,8 +52,10 @@ def of(part: str, number: int) -> Servo | Arm:
         else:
             drawn = arm(seed, hidden, joint) if part == "arm_hidden" else arm(seed)
         return replace(drawn, far=part == "arm_coverage")
-    kinds = unforced_machines.HIDDEN
-    return servo(seed, kinds[number % len(kinds)] if part == "hidden" else None)
+    fine = part.startswith("fine")
+    kinds = unforced_machines.UNASKED if fine else unforced_machines.HIDDEN
+    hidden = kinds[number % len(kinds)] if part.endswith("hidden") else None
+    return servo(seed, hidden, fine=fine)
 
 
 def covered(drawn: Servo | Arm) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Servos of `benchmarks.unforced` on the exact stepper: machine, loop, command and case of each run.
 
 Inertia, friction, gains, delay, rates and command are drawn. The encoder has 4096 counts a turn, as that of a
-hobby servo. The log holds the command and the position, and no force.
+hobby servo, or 16 000. The log holds the command and the position, and no force.
 """
 
 import dataclasses
@@ -16,6 +16,9 @@ from truth.axis.stepper import Loop, Machine, Sensor, reached, simulate
 from truth.chain.stepper import ChainMachine, simulate_chain
 
 COUNT, NOISE = 2 * np.pi / 4096, 2e-4  # rad
+FINE, FINE_NOISE = 2 * np.pi / 16_000, 5e-5  # rad
+# Longest delay [s], also of the servos with the finer encoder.
+LONGEST, LONGEST_FINE = 0.06, 0.1
 SECONDS = 6.0
 # Ticks of the loop [Hz], and ticks a row of the log.
 RATES = ((1000.0, 1), (1000.0, 10), (500.0, 5), (200.0, 4))
@@ -43,6 +46,7 @@ class Servo:
         command: Command a row [rad].
         known: Whether the case states kp, so that the scale is known.
         hidden: Kind that the case does not declare; None: the case is complete.
+        count, noise: Step of the encoder and deviation of its noise [rad].
     """
 
     seed: int
@@ -55,11 +59,18 @@ class Servo:
     command: np.ndarray = field(repr=False)
     known: bool = True
     hidden: str | None = None
+    count: float = COUNT
+    noise: float = NOISE
 
     @property
     def declared(self) -> dict[str, Mapping[str, float]]:
         """Effects of the machine without the hidden one."""
         return {kind: values for kind, values in self.effects.items() if kind != self.hidden}
+
+    @property
+    def sensor(self) -> Sensor:
+        """Encoder of the servo."""
+        return Sensor(position_resolution=self.count, position_noise=self.noise)
 
     def run(self, *, exact: bool = False, **changes: object) -> dict[str, np.ndarray]:
         """Run the exact stepper; `exact` switches the encoder's errors off, changes replace fields."""
@@ -71,7 +82,7 @@ class Servo:
         return simulate(
             Machine(servo.inertia, servo.effects),
             loop,
-            Sensor() if exact else Sensor(position_resolution=COUNT, position_noise=NOISE),
+            Sensor() if exact else servo.sensor,
             rate=servo.rate,
             duration=len(ticks) / servo.rate,
             seed=servo.seed,
@@ -100,7 +111,7 @@ class Servo:
         log = simulate_chain(
             machine,
             [Loop(kind="pd", kp=self.kp, kd=self.kd, reference=reference)],
-            Sensor() if exact else Sensor(position_resolution=COUNT, position_noise=NOISE),
+            Sensor() if exact else self.sensor,
             rate=self.rate,
             duration=len(ticks) / self.rate,
             seed=self.seed,
@@ -178,24 +189,26 @@ class Servo:
         best = scipy.optimize.least_squares(
             left, np.zeros(len(names)), bounds=(-3, 3), diff_step=1e-3, x_scale="jac", max_nfev=12
         )
-        return float(best.cost / (NOISE**2 + COUNT**2 / 12))
+        return float(best.cost / (self.noise**2 + self.count**2 / 12))
 
 
-def servo(seed: int, hidden: str | None = None) -> Servo:
+def servo(seed: int, hidden: str | None = None, *, fine: bool = False) -> Servo:
     """Draw a servo, and the values of an effect that its case does not declare.
 
     Args:
         seed: Of everything.
         hidden: Kind of the effect; None: the case is complete.
+        fine: Whether the encoder has 16 000 counts, the delay is up to 0.1 s, and no gain is known.
     """
     rng = np.random.default_rng([39, seed])
+    longest = LONGEST_FINE if fine else LONGEST
     rate, every = RATES[rng.integers(len(RATES))]
     inertia = float(10 ** rng.uniform(-3.3, -2.0))
     bandwidth, damping = rng.uniform(12.0, 40.0 if rate > 200.0 else 25.0), rng.uniform(0.6, 1.1)
     effects = {
         "viscous_friction": {"coefficient": inertia * rng.uniform(1.0, 5.0)},
         "coulomb_friction": {"level": inertia * rng.uniform(5.0, 25.0)},
-        "command_delay": {"delay": np.ceil(rng.uniform(0.0, 0.06) * rate) / rate},
+        "command_delay": {"delay": np.ceil(rng.uniform(0.0, longest) * rate) / rate},
     }
     command = command_of(rng, rate, every, seed)
     made = Servo(
@@ -207,8 +220,10 @@ def servo(seed: int, hidden: str | None = None) -> Servo:
         kd=2 * damping * inertia * bandwidth,
         effects=effects,
         command=command,
-        known=bool(rng.random() < 0.5),
+        known=bool(rng.random() < 0.5) and not fine,
         hidden=hidden,
+        count=FINE if fine else COUNT,
+        noise=FINE_NOISE if fine else NOISE,
     )
     if hidden is None or hidden in ("viscous_friction", "coulomb_friction"):
         return made
@@ -235,6 +250,7 @@ def command_of(rng: np.random.Generator, rate: float, every: int, seed: int) -> 
 
 def _values(kind: str, made: Servo, rng: np.random.Generator) -> dict[str, float]:
     """Draw the values of a hidden effect."""
+    longest = LONGEST if made.count == COUNT else LONGEST_FINE
     if kind == "saturation":
         peak = float(np.abs(made.run(exact=True)["true_force"]).max())
         return {"limit": peak * rng.uniform(0.45, 0.85)}
@@ -257,7 +273,7 @@ def _values(kind: str, made: Servo, rng: np.random.Generator) -> dict[str, float
             "level": made.inertia * rng.uniform(5.0, 15.0),
             "velocity": rng.uniform(0.1, 0.6),
         },
-        "command_delay": {"delay": round(rng.uniform(0.005, 0.06) * made.rate) / made.rate},
+        "command_delay": {"delay": round(rng.uniform(0.005, longest) * made.rate) / made.rate},
         "command_lag": {"time_constant": rng.uniform(0.01, 0.06)},
         "dead_band": {"width": rng.uniform(0.005, 0.03)},
         "unbalance": {
@@ -285,3 +301,5 @@ HIDDEN = (
     "backlash",
     "voltage_limit",
 )
+# Those that a search tries without being asked.
+UNASKED = tuple(kind for kind in HIDDEN if kind not in ASKED)

@@ -25,8 +25,8 @@ def table(records: list[Record]) -> str:
         f"Written by `python -m benchmarks.unforced` on {date.today()}, at "
         f"{', '.join(sorted({r['commit'] for r in records}))}.",
         "Machines, gains, delays, rates (loops of 200 to 1000 Hz, logs of 50 to 1000 Hz), commands and "
-        "guesses are drawn in each run; the encoder of a servo has 4096 counts, those of an arm 4096 or "
-        "16 000.",
+        "guesses are drawn in each run; the encoder of a servo has 4096 counts unless the table says "
+        "otherwise, those of an arm 4096 or 16 000.",
         "",
         "## Servos: intervals of `identify`",
         "",
@@ -36,6 +36,12 @@ def table(records: list[Record]) -> str:
         *_hidden(of("hidden"), unforced_machines.HIDDEN),
         *_nulls(of("nulls")),
         *_pace([*of("hidden"), *of("nulls")]),
+        "",
+        "## Servos with 16 000 counts, delays up to 0.1 s and no known gain: hidden effects",
+        "",
+        *_hidden(of("fine_hidden"), unforced_machines.UNASKED),
+        *_nulls(of("fine_nulls")),
+        *_pace([*of("fine_hidden"), *of("fine_nulls")]),
         "",
         "## Arms of two joints: intervals of `identify`",
         "",

@@ -149,6 +149,33 @@ def test_without_anything_known_the_ratios_stand_and_no_absolute_value(tmp_path)
     assert "a payload or gain that is known there, stated by set in its [[fit]]" in notes
 
 
+# Unknowns of the loop: lines of the case in front of the controller and in it, name and true value.
+IN_THE_LOOP = {
+    "dead band": ("", "dead_band = { guess = 0.02 }", "controller.dead_band", 0.008),
+    "lag": (
+        '[[effects]]\nkind = "command_lag"\ntime_constant = { guess = 0.03 }',
+        "",
+        "command_lag.time_constant",
+        0.012,
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", IN_THE_LOOP)
+def test_what_else_is_unknown_of_the_loop_is_found(what):
+    before, behind, name, true = IN_THE_LOOP[what]
+    text = CASE.replace("[controller]", f"{before}\n[controller]")
+    text = text.replace("period = 0.001", f"period = 0.001\n{behind}")
+    kind, key = ("dead_band", "width") if what == "dead band" else name.split(".")
+    result = identify(text, log(**{kind: {key: true}}))
+    assert result.model_complete is True
+    assert result.parameters[name].std < 0.05 * true
+    for unknown, value in {**TRUE, name: true}.items():
+        found = result.parameters[unknown]
+        assert abs(found.value - value) < 4 * found.std, unknown
+
+
 @pytest.mark.slow
 def test_a_missing_ripple_makes_the_model_incomplete():
     ripple = {"cogging": {"amplitude": 0.02, "period": 2 * np.pi / 12, "phase": 0.3}}
