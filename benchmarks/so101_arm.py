@@ -112,6 +112,12 @@ def _page(found: Found) -> str:
         "",
         *_gaps(first),
         "",
+        "## What the file has wrong",
+        "",
+        "Values of the community's file, and those that were found, by joint; with one standard deviation.",
+        "",
+        *_beside_file(first),
+        "",
         "## What an MJCF does not hold",
         "",
         "The same case, dead bands and friction in proportion to the load unknown at every joint:",
@@ -195,6 +201,22 @@ def _gaps(result: dict) -> list[str]:
     for name, gap in {**result["gap"]["fits"], **result["gap"]["validations"]}.items():
         rows.append(f"| {name} | " + " | ".join(f"{1e3 * x:.3g}" for x in gap["simulation"]) + " |")
     return rows
+
+
+def _beside_file(result: dict) -> list[str]:
+    """Return a table of the values of the file, and of those that were found in their place."""
+    rows: dict[str, list[str]] = {}
+    for name, found in result["parameters"].items():
+        if "in_file" not in found or "[" not in name:
+            continue
+        joint = int(name.split("[")[1].split("]")[0])
+        what = f"{name.replace(f'[{joint}]', '')} [{found['unit']}]"
+        value = "not identifiable"
+        if found["value"] is not None:
+            value = f"{found['value']:.3g} ({found['std']:.2g})"
+        rows.setdefault(what, ["-"] * len(JOINTS))[joint - 1] = f"{found['in_file']:.3g} -> {value}"
+    head = ["| value | " + " | ".join(JOINTS) + " |", "|---" * 7 + "|"]
+    return [*head, *(f"| {what} | " + " | ".join(cells) + " |" for what, cells in rows.items())]
 
 
 def _row(result: dict, what: str) -> str:

@@ -282,6 +282,9 @@ def table(content: dict[str, Any]) -> str:
         for name, run in runs.items()
     ]
     lines.append(f"| mean, fitted rows | {' | '.join(fitted)} |")
+    if "jaxid" in runs:
+        cells = [_yes(run.get("converged")) if name == "jaxid" else "" for name, run in runs.items()]
+        lines.append(f"| converged | {' | '.join(cells)} |")
     for what, head in (("seconds", "time [s]"), ("processor", "processor [s]")):
         cells = [f"{run[what]:.0f}" if what in run and name != "own" else "" for name, run in runs.items()]
         lines.append(f"| {head} | {' | '.join(cells)} |")
@@ -296,6 +299,10 @@ def table(content: dict[str, Any]) -> str:
         for k, joint in enumerate(JOINTS):
             lines.append(f"| {joint} | {' | '.join(f'{v[k]:.3g}' for v in values.values())} |")
     return "\n".join(lines) + "\n"
+
+
+def _yes(flag: bool | None) -> str:
+    return "yes" if flag else "no"
 
 
 def main() -> None:
