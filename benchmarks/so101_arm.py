@@ -114,7 +114,7 @@ def _page(found: Found) -> str:
         "",
         *_gaps(first),
         "",
-        f"Over the motions left out and the first five joints that is {_mean_left_out(first):.1f} mrad on average.",
+        f"The mean over the motions left out and the first five joints is {_mean_left_out(first):.1f} mrad.",
         "",
         "## What the file has wrong",
         "",
