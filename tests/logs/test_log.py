@@ -142,10 +142,10 @@ def test_reading_is_quick(tmp_path):
     path = write_csv(tmp_path / "log.csv", signals(25000))
     seconds = []
     for _ in range(3):
-        start = time.perf_counter()
+        start = time.process_time()
         read_log(path, COLUMNS)
-        seconds.append(time.perf_counter() - start)
-    # Measured: 0.05 s on two cores. The bound leaves room for a busy machine.
+        seconds.append(time.process_time() - start)
+    # Measured: 0.05 s. Time of the processor, since other tests run beside this one.
     assert min(seconds) < 0.2
 
 

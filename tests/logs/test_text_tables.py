@@ -323,7 +323,7 @@ def test_reading_is_not_slowed_by_decimal_commas(tmp_path):
     path.write_text(
         "t;q;u\n" + "".join(f"{k / 1000:.3f};0,123456;-1,5\n".replace(".", ",") for k in range(50_000))
     )
-    start = time.perf_counter()
+    start = time.process_time()
     read_log(path, COLUMNS)
-    # Measured: 0.06 s on two cores. The bound leaves room for a busy machine.
-    assert time.perf_counter() - start < 0.6
+    # Measured: 0.06 s. Time of the processor, since other tests run beside this one.
+    assert time.process_time() - start < 0.6
