@@ -4,8 +4,8 @@
 
 Each joint is an axis behind a servo of unknown gains, and is fitted by `identify` to stretches of six
 motions. The fitted model then follows the six other motions from their commands. Beside it stand the
-community's MJCF, replayed by MuJoCo, and a simulation that goes where it is told. Writes so101.json,
-so101.md and so101.svg.
+community's MJCF, replayed by MuJoCo, a play operator with a lag that is fitted to the same stretches, and a
+simulation that goes where it is told. Writes so101.json, so101.md and so101.svg.
 """
 
 import argparse
@@ -22,6 +22,7 @@ import numpy as np
 import jaxid
 from benchmarks.cold import commit_of
 from benchmarks.measured import measured_folder
+from benchmarks.play_operator import fitted, left_of
 from benchmarks.so101_picture import picture
 from jaxid.gap import SimulationGap, simulation_of_log
 from jaxid.logs.log import Log
@@ -162,8 +163,8 @@ def followed(machine: Machine, path: Path) -> SimulationGap | None:
 
 
 def compared(model: mujoco.MjModel, logs: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Return RMS [mrad] by motion and joint of the community's file and of the command, and shown curves."""
-    out: dict[str, Any] = {"file": {}, "command": {}, "shown": {}}
+    """Return RMS [mrad] by motion and joint of what stands beside the fitted model, and shown curves."""
+    out: dict[str, Any] = {"file": {}, "command": {}, "play": plays(logs), "shown": {}}
     for name, motion in logs.items():
         q, simulated = columns(motion, "q"), rollout(model, motion)
         for what, course in (("file", simulated), ("command", columns(motion, "cmd"))):
@@ -177,6 +178,22 @@ def compared(model: mujoco.MjModel, logs: dict[str, np.ndarray]) -> dict[str, An
                     what: [round(float(x), 6) for x in course[rows, joint - 1]]
                     for what, course in curves.items()
                 }
+    return out
+
+
+def plays(logs: dict[str, np.ndarray]) -> dict[str, list[float]]:
+    """Return RMS [mrad] by motion and joint of play operators that are fitted to the stretches of `run`."""
+    out: dict[str, list[float]] = {name: [] for name in logs}
+    for joint in range(1, len(JOINTS) + 1):
+        courses = {name: (motion[f"cmd{joint}"], motion[f"q{joint}"]) for name, motion in logs.items()}
+        stretches = [
+            (command[first : first + ROWS], position[first : first + ROWS])
+            for name, first in FITTED.items()
+            for command, position in [courses[name]]
+        ]
+        numbers = fitted([s for s in stretches if np.ptp(s[0]) > MOVES], ROW)
+        for name, course in courses.items():
+            out[name].append(round(1e3 * left_of(numbers, *course, ROW), 2))
     return out
 
 
@@ -203,13 +220,14 @@ def table(content: dict[str, Any]) -> str:
         f"Fitted: {ROWS} rows each of {', '.join(FITTED)}, where the joint moves.",
         f"Left out: {', '.join(left)}.",
         "",
-        "| joint | left out | fitted motions | left out, community's MJCF | left out, as commanded | s |",
-        "|---|---|---|---|---|---|",
+        "| joint | left out | fitted motions | left out, community's MJCF | left out, play operator "
+        "| left out, as commanded | s |",
+        "|---|---|---|---|---|---|---|",
     ]
     rows = []
     for joint, record in sorted(joints.items()):
         row = [mean(record, left), mean(record, list(FITTED)), others("file", joint, left)]
-        row += [others("command", joint, left), record["seconds"]]
+        row += [others("play", joint, left), others("command", joint, left), record["seconds"]]
         rows.append(row)
         cells = " | ".join(f"{x:.1f}" for x in row)
         lines.append(f"| {JOINTS[joint - 1]} | {cells} |")
@@ -219,6 +237,7 @@ def table(content: dict[str, Any]) -> str:
         lines.append(f"| **mean** | {' | '.join(f'**{x:.1f}**' for x in averaged)} | {total:.0f} |")
     lines += [
         "",
+        "The play operator has a lag and a delay: four numbers a joint without physics, of the same rows.",
         f"In {' and '.join(TOUCHING)} the arm touches the table, which a joint alone does not know.",
         "Which motions are fitted was decided with all twelve in view, and so was the model.",
     ]
