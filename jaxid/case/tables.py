@@ -92,11 +92,14 @@ UNKNOWN_OF_CONTROLLER = {
     "limit": ("force", "positive"),
     "delay": ("time", "nonnegative"),
     "dead_band": ("position", "nonnegative"),
+    "coulomb": ("force", "nonnegative"),
+    "viscous": ("force*time/position", "nonnegative"),
+    "inertia": ("inertia", "nonnegative"),
 }
 # Fields of every controller that the columns of a log, or an effect, decide.
 _OF_LOG = ("own_velocity", "lag", "speed")
-# Laws whose gains may be unknown.
-_LINEAR = ("cascade_pd", "pd", "pid")
+# Laws whose values may be unknown. An adaptive law fits its model itself.
+_WITH_UNKNOWNS = ("cascade_pd", "pd", "pid", "friction_compensation", "computed_torque", "flatness")
 # Laws whose gains act on a velocity that is itself a gain times the position error.
 _CASCADES = ("cascade_pd",)
 
@@ -111,7 +114,7 @@ def unknown_info(kind: str, name: str) -> ParameterInfo:
 
 def _maybe_unknown(read: Reader, kind: str, name: str) -> Reader:
     """Return the reader of a known value, or of one with a guess."""
-    if kind not in _LINEAR:
+    if kind not in _WITH_UNKNOWNS:
         return read
     info = unknown_info(kind, name)
     table = schema_of(value_keys(info))

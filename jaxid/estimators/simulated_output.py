@@ -263,6 +263,11 @@ def notes_of(
     if numerics.segment:
         seconds = numerics.segment * log.period
         notes.append(f"restarted from the log every {seconds:.3g} s, because it would drift off otherwise")
+    law = machine.controller
+    if law is not None and "model" in law.of_machine and "estimator" not in law.of_machine:
+        notes.append(
+            "the law computes forces with the guesses of the case: with other guesses it is another law"
+        )
     if minimiser_of(minimiser) is not None:
         notes.append(f"minimised by {minimiser_name(minimiser)}")
     return tuple(notes)

@@ -83,12 +83,95 @@ def test_a_delay_between_two_ticks_is_a_line_between_them():
         ("kp = { guess = 6.0 }", "kp = { guess = -6.0 }", "kp"),
         ("delay = { guess = 0.008 }", "delay = -0.01", "delay"),
         ("period = 0.001", "period = { guess = 0.001 }", "period"),
-        ('kind = "pd"', 'kind = "computed_torque"', "kp"),
+        ('kind = "pd"', 'kind = "adaptive"', "kp"),
     ],
 )
 def test_unsound_unknowns_are_refused(old, new, what):
     with pytest.raises(InputError, match=what):
         jaxid.load_case(tomllib.loads(CASE.replace(old, new)))
+
+
+FED = {"coulomb": 0.02, "viscous": 2e-3, "inertia": 1.5e-3}
+# What the law adds for viscous friction is known, as are inertia and viscous friction of the machine.
+GUESSED = {"coulomb": {"guess": 0.05}, "viscous": FED["viscous"], "inertia": {"guess": 5e-4}}
+
+
+def fed_forward(seed: int = 0) -> dict[str, np.ndarray]:
+    """Return a log without a force of a servo that feeds inertia and friction forward."""
+    asked = moves(TIME, [0.0, 0.6, -0.4, 0.9], [2.0, 4.0, 1.0, 3.0], 40.0, rest=0.2)
+    asked += multisine(TIME, [0.7, 1.9, 3.1], 0.15, seed)
+    reached = np.concatenate([np.full(20, asked[0]), asked])[: TIME.size]
+    friction = {"viscous_friction": {"coefficient": 4e-3}, "coulomb_friction": {"level": 0.03}}
+    gains = {"kp": 2.0, "kd": 0.05, "velocity_average": 8}
+    loop = Loop(kind="friction_compensation", limit=np.inf, reference=reached, **gains, **FED)
+    sensor = Sensor(position_resolution=2 * np.pi / 4096, position_noise=2e-4)
+    run = Setup(Machine(inertia=2e-3, effects=friction), loop, sensor, RATE, SECONDS, seed).run()
+    return {"t": run["t"], "q": run["position"], "r": asked}
+
+
+@pytest.mark.parametrize(
+    ("kind", "fed", "unknown"),
+    [
+        ("friction_compensation", GUESSED, {"kp", "kd", "delay", "coulomb", "inertia"}),
+        ("computed_torque", {}, {"kp", "kd", "delay"}),
+    ],
+)
+def test_laws_that_feed_a_model_forward_may_have_unknown_gains(kind, fed, unknown):
+    case = tomllib.loads(CASE)
+    case["controller"] |= {"kind": kind, **fed}
+    controller = jaxid.load_case(case).controller
+    assert controller is not None
+    assert controller.unknown.keys() == unknown
+
+
+@pytest.mark.slow
+def test_values_that_a_law_feeds_forward_are_found_without_a_force():
+    case = tomllib.loads(CASE)
+    del case["log"]["force"]
+    case["controller"] |= {"kind": "friction_compensation", "velocity_average": 8, **GUESSED}
+    result = jaxid.identify(case, fed_forward())
+    assert result.estimate.converged
+    true = TRUE | {"controller.delay": 0.02, "controller.coulomb": 0.02, "controller.inertia": 1.5e-3}
+    assert set(result.parameters) == set(true)
+    for name, value in true.items():
+        found = result.parameters[name]
+        assert abs(found.value - value) < 4 * found.std, name
+        assert found.std < 0.03 * value, name
+
+
+def computed_torque(known_inertia: float) -> dict[str, np.ndarray]:
+    """Return a log without a force of a servo that feeds forward the force for an inertia.
+
+    The force is a PD law of a reference with more added to it, so that the stepper needs no such law.
+    """
+    asked = moves(TIME, [0.0, 0.6, -0.4, 0.9], [2.0, 4.0, 1.0, 3.0], 40.0, rest=0.2)
+    asked += multisine(TIME, [0.7, 1.9, 3.1], 0.15, 0)
+    curvature = np.diff(np.pad(asked, 1, mode="reflect", reflect_type="odd"), 2) * RATE**2
+    kp, slope = 2.0, 0.05 * RATE
+    added = np.zeros_like(asked)
+    for k in range(asked.size):
+        added[k] = (known_inertia * curvature[k] + slope * added[k - 1]) / (kp + slope)
+    friction = {"viscous_friction": {"coefficient": 4e-3}, "coulomb_friction": {"level": 0.03}}
+    loop = Loop(kind="pd", kp=kp, kd=0.05, limit=np.inf, reference=asked + added)
+    sensor = Sensor(position_resolution=2 * np.pi / 4096, position_noise=2e-4)
+    run = Setup(Machine(inertia=2e-3, effects=friction), loop, sensor, RATE, SECONDS, 0).run()
+    return {"t": run["t"], "q": run["position"], "r": asked}
+
+
+@pytest.mark.slow
+def test_a_force_that_the_law_computes_gives_the_scale():
+    case = tomllib.loads(CASE)
+    del case["log"]["force"], case["controller"]["delay"]
+    # The law knows this guess; the true inertia is 2e-3.
+    case["plant"]["parameters"]["inertia"] = {"guess": 1.5e-3}
+    case["controller"]["kind"] = "computed_torque"
+    result = jaxid.identify(case, computed_torque(1.5e-3))
+    assert result.estimate.converged
+    assert any("the law computes forces with the guesses" in note for note in result.estimate.notes)
+    for name, value in (TRUE | {"inertia": 2e-3}).items():
+        found = result.parameters[name]
+        assert abs(found.value - value) < 4 * found.std, name
+        assert found.std < 0.01 * value, name
 
 
 def test_a_method_that_does_not_simulate_refuses_unknown_gains():
