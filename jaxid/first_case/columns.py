@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxid.errors import InputError
 from jaxid.first_case.balance import has_direction
 from jaxid.first_case.two_encoders import TwoEncoders, without_load
-from jaxid.first_case.words import FORCES, PHASES, Meaning, meaning_of_joint
+from jaxid.first_case.words import D_ENDINGS, FORCES, PHASES, Meaning, meaning_of_joint
 from jaxid.logs.log import MINIMUM_SAMPLES
 from jaxid.logs.readers.dialect import split_unit
 from jaxid.logs.rough_inertia import correlation
@@ -23,6 +23,8 @@ NO_TIME_RATE = 1000.0
 _SAME_COURSE, _SAME_SIZE = 0.95, 1.25
 # Correlation with the position from which a wanted value without a quantity counts as a reference.
 _FOLLOWED = 0.5
+# Correlation with the position from which a column whose integral is that position is its velocity.
+_INTEGRATED = 0.9
 # Part of its peak below which a force without a sign comes at its least, if it is a magnitude.
 _NEAR_ZERO = 0.05
 # Most columns without a known meaning that are listed.
@@ -128,7 +130,8 @@ def columns_of(
         rows = np.arange(flat.size)
         filled = flat if known.all() else np.interp(rows, rows[known], flat[known])
         out.append(Column(meaning, filled, unit))
-    return _with_joints_by_symbol([_as_acceleration(column, out) for column in out])
+    out = [_as_acceleration(column, out) for column in out]
+    return _with_joints_by_symbol([_derived_or_desired(column, out) for column in out])
 
 
 def _as_acceleration(column: Column, columns: Sequence[Column]) -> Column:
@@ -146,6 +149,31 @@ def _as_acceleration(column: Column, columns: Sequence[Column]) -> Column:
     if own or not speeds or not any(m.quantity == "position" for m in others):
         return column
     return replace(column, meaning=replace(meaning, quantity="acceleration"))
+
+
+def _derived_or_desired(column: Column, columns: Sequence[Column]) -> Column:
+    """Return a column called xd as the velocity of x, or as its wanted value, by the values of both.
+
+    A wanted value has the course of the position, and the integral of a velocity has it.
+    """
+    symbol = D_ENDINGS.get(column.name.casefold())
+    if symbol is None or column.meaning.quantity:
+        return column
+    of_symbol = [c for c in columns if c.meaning.symbol == symbol and c.meaning.quantity == "position"]
+    measured = [c.values for c in of_symbol if not c.meaning.reference]
+    if len(measured) != 1:
+        return column
+    [position] = measured
+    rows = np.linspace(-1.0, 1.0, position.size)
+    integral = np.cumsum(column.values)
+    # The constant of integration, an offset and a trend of the readings say nothing.
+    alike = correlation(*(x - np.polyval(np.polyfit(rows, x, 1), rows) for x in (integral, position)))
+    meaning = replace(column.meaning, joint=(), symbol=symbol)
+    if alike > _INTEGRATED:
+        return replace(column, meaning=replace(meaning, quantity="velocity"))
+    if correlation(column.values, position) > _INTEGRATED:
+        return replace(column, meaning=replace(meaning, quantity="position", reference=True))
+    return column
 
 
 def _with_joints_by_symbol(columns: list[Column]) -> list[Column]:

@@ -83,6 +83,8 @@ _DERIVATIVES = {
     for symbol in (*_SYMBOLS, "q")
     for pattern, order in (("d{}", 1), ("{}dot", 1), ("dd{}", 2), ("{}ddot", 2), ("{}dd", 2))
 }
+# Names that end as a derivative (xp with the German Punkt) or as what is desired: values tell them apart.
+D_ENDINGS = {f"{symbol}{ending}": symbol for symbol in _SYMBOLS for ending in "dp"}
 # Velocities along an axis. A force along one is mostly that of a sensor between tool and workpiece.
 _ALONG = {f"v{axis}": axis for axis in "xyz"}
 _ROLE = {word: role for role, words in _ROLES.items() for word in words.split()}

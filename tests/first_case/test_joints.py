@@ -138,6 +138,19 @@ def test_alpha_is_an_angle_unless_a_velocity_stands_beside_it(tmp_path):
     assert jaxid.init(alone).tables["log"]["position"] == "theta"
 
 
+@pytest.mark.parametrize(("name", "dotted"), [("theta", "thetad"), ("phi", "phip"), ("x", "xd")])
+def test_values_say_whether_a_name_is_that_of_a_derivative_or_of_what_is_desired(name, dotted):
+    log = cart_log((name, "rest", "force"), seconds=2.0)
+    del log["rest"]
+    speed = log | {dotted: np.gradient(log[name], log["t"])}
+    # What the machine follows is 40 ms ahead, as that of a servo.
+    desired = log | {dotted: np.append(log[name][20:], np.full(20, log[name][-1]))}
+    nothing = log | {dotted: log["force"]}
+    assert jaxid.init(speed).tables["log"]["velocity"] == dotted
+    assert jaxid.init(desired).tables["log"]["reference"] == dotted
+    assert not {"velocity", "reference"} & jaxid.init(nothing).tables["log"].keys()
+
+
 def test_joints_that_only_symbols_name():
     log = cart_log(seconds=1.0)
     gantry = {"t": log["t"], "x_pos": log["x"], "y_pos": log["alpha"]}
