@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -16,8 +17,9 @@ from jaxid.estimators.simulated_output import choose_numerics
 from jaxid.logs.log import Log
 from jaxid.machine import Machine
 from jaxid.numerics.lanes import Steps
-from jaxid.simulation.noisy_loop import ReadingNoise, estimated_noise
+from jaxid.simulation.noisy_loop import ReadingNoise, estimated_noise, mean_readings
 from jaxid.simulation.replay import Numerics, make_replay
+from jaxid.simulation.sensor_noise import position_noise
 from jaxid.simulation.step_size import TooStiffError
 
 # Number of times that the noise of the encoder is estimated, and the unknowns refitted.
@@ -93,6 +95,43 @@ def noise_of_parts(
             continue
         found.append(estimated_noise(at, part.log, replay, follows=follows, before=near))
     return found
+
+
+def far_from_logs(
+    parts: Sequence[Part], estimate: Estimate, numerics: Numerics | None = None, *, times: float
+) -> bool:
+    """Check that a model is incomplete: noise in its loop does not explain what a fit without noise leaves.
+
+    The log counts of which the fit leaves most.
+
+    Args:
+        parts: The logs.
+        estimate: A fit to all of them without noise.
+        numerics: Settings of the integration; None: chosen from machines and logs.
+        times: RMS over the noise of a reading from which a model is far from a log.
+    """
+    ends = np.cumsum([part.log.samples for part in parts])[:-1]
+    offs = np.split(estimate.residual, ends)
+    left = [_over_noise(part, off) for part, off in zip(parts, offs, strict=True)]
+    worst = parts[int(np.argmax(left))]
+    if max(left) <= times:
+        return False
+    at = worst.at(estimate.theta)
+    [noise] = noise_of_parts([worst], estimate.theta, numerics)
+    if noise is None:
+        return False
+    replay = make_replay(at, worst.log, numerics or choose_numerics(at, worst.log))
+    replay = replay.following(at.parameters.places, jnp.asarray(at.parameters.guess))
+    mean = np.asarray(mean_readings(noise.on(replay), at.plant))
+    return _over_noise(worst, worst.log.filled - mean) > times
+
+
+def _over_noise(part: Part, off: Float[np.ndarray, "time n"]) -> float:
+    """Return the largest RMS of a joint over the noise of its readings; infinite where a loop diverges."""
+    noise = position_noise(part.machine, part.log)
+    with np.errstate(invalid="ignore", over="ignore"):
+        rms = np.sqrt(np.nan_to_num(np.nanmean(np.square(off), axis=0), nan=np.inf))
+    return float(np.max(rms[noise > 0] / noise[noise > 0], initial=0.0))
 
 
 def _words(noise: Sequence[ReadingNoise | None]) -> str:

@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxid.consistency.absent import without_scale
-from jaxid.controllers.linear import PD, PID, CascadePD
+from jaxid.controllers.linear import PD, PID, CascadePD, FrictionCompensation
 from jaxid.estimators.apart.joint import stands_apart
 from jaxid.estimators.apart.whole import arm_steps, start_by_joints, whole_steps
 from jaxid.estimators.coarse_starts import coarse_starts
 from jaxid.estimators.effort import SCALE, Scale, scale_by_effort
 from jaxid.estimators.estimate import Estimate, misfit
-from jaxid.estimators.mean_readings import fitted_with_noise
+from jaxid.estimators.mean_readings import far_from_logs, fitted_with_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.servo_law import beside_other_law, leaves_law_open, with_law_of_log
 from jaxid.estimators.servo_rate import leaves_course_open, leaves_rate_open, with_rate_of_log
@@ -44,8 +44,15 @@ if TYPE_CHECKING:
 _STARTS_TOGETHER = 2
 # Factor in RMS over the noise beyond which a fit without a scale is tried from starts that are further away.
 _FAR = 2.0
+# The same, from which mean readings of several logs are not fitted.
+_INCOMPLETE = 6.0
 # Keys of each law that give its command a scale; without one that is known, the scale is free.
-_GAINS = {CascadePD: ("kv",), PD: ("kp", "kd"), PID: ("kp", "ki", "kd")}
+_GAINS = {
+    CascadePD: ("kv",),
+    PD: ("kp", "kd"),
+    PID: ("kp", "ki", "kd"),
+    FrictionCompensation: ("kp", "kd", "coulomb", "viscous", "inertia"),
+}
 
 
 def unforced_steps(
@@ -169,7 +176,8 @@ def _by_mean_readings(
     """Return the best fit of the mean readings, at the ticks of the delay near that of a fit without noise.
 
     The noise changes the misfit by more than one tick of the delay does, so that only mean readings show
-    which is the best.
+    which is the best. If a model leaves far more of several logs than noise, they say no more than runs
+    without noise do, and their fits take minutes.
 
     Args:
         machine: Machine of all logs.
@@ -178,9 +186,12 @@ def _by_mean_readings(
         options: Further arguments of `output_error_steps`.
 
     Returns:
-        The fit; that without noise if nothing is known of the noise.
+        The fit; that without noise if nothing is known of the noise, or the model is far from several logs.
     """
-    at, *equal = (yield from best_ticks(machine, parts, plain.theta, options.get("numerics"))) or [
+    numerics = options.get("numerics")
+    if len(parts) > 1 and far_from_logs(parts, plain, numerics, times=_INCOMPLETE):
+        return plain
+    at, *equal = (yield from best_ticks(machine, parts, plain.theta, numerics)) or [
         plain.theta
     ]
     found = yield from fitted_with_noise(machine, parts, at, **options)

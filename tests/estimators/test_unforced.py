@@ -11,6 +11,7 @@ from benchmarks import unforced_starts
 from benchmarks.unforced import covered, of
 from benchmarks.unforced_machines import servo
 from jaxid.errors import InputError
+from jaxid.estimators.unforced import scale_group
 from jaxid.session import open_session
 from truth.axis.machines import Setup, moves, multisine
 from truth.axis.stepper import Loop, Machine, Sensor
@@ -203,6 +204,21 @@ def test_the_period_is_questioned_once_for_several_logs():
     assert sum("period of the servo's loop" in f.what for f in found) == 1
 
 
+@pytest.mark.parametrize(
+    ("fed", "free"),
+    [({"inertia": {"guess": 1e-3}, "coulomb": {"guess": 0.01}}, True), ({"inertia": 1e-3}, False)],
+)
+def test_what_a_law_feeds_forward_has_the_scale_of_its_gains(fed, free):
+    case = tomllib.loads(FREE)
+    case["controller"] |= {"kind": "friction_compensation", **fed}
+    session = open_session(case, log())
+    found = scale_group(session.machine, session.fit.log)
+    names = {session.machine.parameters.names[k] for k in found}
+    every = {"inertia", "viscous_friction.coefficient", "coulomb_friction.level"}
+    every |= {f"controller.{name}" for name in ("kp", "kd", "inertia", "coulomb")}
+    assert names == (every if free else set())
+
+
 def test_a_loop_without_a_reference_is_refused():
     given = log()
     given.pop("r")
@@ -269,6 +285,17 @@ def test_two_logs_tell_more_than_one():
         assert abs(found.value - true) < 4 * found.std, name
         assert found.std < 0.9 * one.parameters[name].std, name
     assert [gap.name for gap in both.gaps] == [run.name for run in both.session.fits]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("complete", [True, False])
+def test_mean_readings_of_several_logs_are_fitted_where_noise_explains_what_is_left(complete):
+    case = tomllib.loads(CASE)
+    if not complete:
+        case["effects"] = case["effects"][:1]
+    result = jaxid.identify(case, [log(), log(seed=1)])
+    assert result.model_complete is complete
+    assert any("the mean is fitted" in note for note in result.estimate.notes) is complete
 
 
 @pytest.mark.slow
