@@ -191,9 +191,7 @@ def _by_mean_readings(
     numerics = options.get("numerics")
     if len(parts) > 1 and far_from_logs(parts, plain, numerics, times=_INCOMPLETE):
         return plain
-    at, *equal = (yield from best_ticks(machine, parts, plain.theta, numerics)) or [
-        plain.theta
-    ]
+    at, *equal = (yield from best_ticks(machine, parts, plain.theta, numerics)) or [plain.theta]
     found = yield from fitted_with_noise(machine, parts, at, **options)
     return plain if found is None else with_equal_ticks(found, equal)
 

@@ -25,6 +25,7 @@ DRIVE = {
 SPRING = {"load_inertia": 0.015, "stiffness": 0.015 * (2 * np.pi * 5.0) ** 2}
 KP, KD, RATE, EVERY, SECONDS = 40.0, 2.0, 500.0, 2, 12.0
 
+
 def resonance(values: dict[str, float]) -> float:
     """Return the natural frequency of motor and load, free [Hz]."""
     load = values["load_inertia"]
