@@ -203,10 +203,17 @@ def law_findings(
     jumps = confirmed and machine.reference_hold == "zero_order"
     least, findings = _LEFT_AT_JUMPS if jumps else _LEFT, []
     for k, relative in enumerate(replayed.relative):
-        if relative < least or np.sqrt(np.mean(off[:, k] ** 2)) < _NOISY * noise[k]:
+        if relative < least:
+            continue
+        best = _best_law(machine, log, k)
+        # A coarse encoder makes the command rough, and a wrong gain then leaves no more than its high band.
+        # Only a law that explains this too shows that it is no noise.
+        size = max(float(np.linalg.norm(log.force[:, k])), 1e-300)
+        settled = float(np.linalg.norm(off[_SETTLING:, k])) / size
+        noisy = np.sqrt(np.mean(off[:, k] ** 2)) < _NOISY * noise[k]
+        if noisy and (best is None or settled < _CONTRADICTED or best.remaining > _FIFTH * settled):
             continue
         number = f" {k + 1}" if len(replayed.relative) > 1 else ""
-        best = _best_law(machine, log, k)
         what = f"the declared control law leaves {100 * relative:.3g} % of the logged command{number}"
         if best is None or not best.remaining < _BETTER * relative:
             hint = "check kind, gains, period and limit in [controller], and the column of the reference"

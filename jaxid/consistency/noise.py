@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -253,12 +254,19 @@ def _high_band(x: Float[np.ndarray, "time k"]) -> np.ndarray:
     return spectrum[(f > 0.3) & (f < 0.475)] / np.linalg.norm(window)
 
 
-def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.ndarray:
-    """Return the white noise of each force that the residual of inverse dynamics allows; inf if unknown."""
+def _in_band(
+    machine: Machine, log: Log, data: Prepared, fit: BalanceFit, *, subtract: bool = True
+) -> np.ndarray:
+    """Return the white noise of each force that the residual of inverse dynamics allows; inf if unknown.
+
+    Without `subtract` the residual counts with the noise of the positions in it: a bound that holds even if
+    that is most of it.
+    """
     out = np.full(log.force.shape[1], np.inf)
     if not all(log.measured):
         return out
     values, residual = fit.fit(bounded=False)
+    machine = _with_position_noise_of_log(machine, log)
     rate = log.rate_hz / data.recipe.decimation
     top = data.recipe.edge * log.rate_hz / 2 if data.recipe.edge else data.recipe.band_hz(log.rate_hz)
     top = min(top, 0.5 * rate)
@@ -272,10 +280,22 @@ def _in_band(machine: Machine, log: Log, data: Prepared, fit: BalanceFit) -> np.
         if band.sum() < _FREQUENCIES or machine.gain[k] == 0:
             continue
         excess = power[band] / np.log(2.0) - np.interp(f[band], f_all, of_position[:, j])
+        excess = excess if subtract else power[band] / np.log(2.0)
         white = excess / np.square(data.recipe.decimator.response(f[band], log.rate_hz))
         density = max(float(np.median(white)), 0.0)
         out[k] = np.sqrt(density * log.rate_hz / 2) / abs(machine.gain[k])
     return out
+
+
+def _with_position_noise_of_log(machine: Machine, log: Log) -> Machine:
+    """Return a machine without the stated noise of positions, if that is far above what the log can have."""
+    stated = machine.sensor.position_std
+    if stated is None or log.integrated:
+        return machine
+    shown = signals.high_band_std(log.filled)
+    if not np.any((np.asarray(stated) > _FACTOR * shown) & np.array(log.measured)):
+        return machine
+    return replace(machine, sensor=replace(machine.sensor, position_noise=None, position_resolution=None))
 
 
 def _at(machine: Machine, fit: BalanceFit, values: np.ndarray) -> Machine:
@@ -325,15 +345,17 @@ def _force(
     stated = np.broadcast_to(np.asarray(machine.sensor.force_noise), estimate.shape)
     high, low = _beyond_controller(machine, log).noise, _in_band(machine, log, data, fit)
     white = (high < _ALIKE * low) & (low < _ALIKE * high)
+    most = np.maximum(estimate, np.minimum(high, _in_band(machine, log, data, fit, subtract=False)))
     findings = []
-    for k, (of, found) in enumerate(zip(stated, estimate, strict=True)):
-        more = found > _FACTOR * of and white[k]
-        if not more and not of > _FACTOR * found:
+    for k, of in enumerate(stated):
+        more = estimate[k] > _FACTOR * of and white[k]
+        if not more and not of > _FACTOR * most[k]:
             continue
-        bound = "about" if more else "at most"
+        bound, found = ("about", estimate[k]) if more else ("at most", most[k])
         what = f"force_noise = {of:.3g} is stated, and the log has {bound} {found:.2g}"
         number = f" {k + 1}" if estimate.size > 1 else ""
         hint = f"set force_noise = {found:.2g} in [sensor], in units of the logged column, or remove it"
+        hint = hint if found > 0 else "remove it from [sensor]"
         findings.append(Finding("warning", what, f"{log.source}, force{number}", hint))
     return findings
 
@@ -362,5 +384,13 @@ def _position(machine: Machine, log: Log) -> list[Finding]:
         if np.isfinite(noise[j]) and noise[j] > _FACTOR * found[j]:
             what = f"position_noise = {noise[j]:.3g} is stated, and the log has about {found[j]:.2g}"
             hint = f"set position_noise = {found[j]:.2g} in [sensor], or remove it"
+            findings.append(Finding("warning", what, where, hint))
+        rounding = step / np.sqrt(12)
+        if np.isnan(resolution[j]) and rounding > _FACTOR * noise[j] > 0:
+            what = (
+                f"position_noise = {noise[j]:.3g} is stated, and the readings lie on steps of {step:.3g}, "
+                f"whose rounding alone is {rounding:.2g}"
+            )
+            hint = f"state position_resolution = {step:.3g} in [sensor] too, or remove position_noise"
             findings.append(Finding("warning", what, where, hint))
     return findings

@@ -12,6 +12,7 @@ from jaxid.errors import InputError
 from jaxid.session import Session, open_session
 from tests.consistency.test_noise import EFFECTS, LOOPS, setup
 from truth.axis.cases import case_text
+from truth.axis.stepper import Sensor
 
 NAMES = {"t": "t", "q": "position", "u": "force", "ref": "reference"}
 LAWS = {
@@ -43,6 +44,15 @@ def opened(log: dict, law: dict, kind: str) -> Session:
 )
 def test_the_right_law_raises_nothing(runs, loop, law):
     assert opened(runs[loop], LAWS[law], loop).findings == ()
+
+
+def test_a_wrong_gain_behind_a_coarse_encoder_is_named():
+    """What it leaves is less than twice the high band of the command, which differentiates the counts."""
+    run = dataclasses.replace(setup(noise=0.0), sensor=Sensor(position_resolution=2e-4)).run()
+    log = {column: run[field] for column, field in NAMES.items()}
+    assert opened(log, LAWS["velocity"], "pd").findings == ()
+    with pytest.raises(InputError, match=r"take kind = 'pd' with .* kp = 2400, kd = 60 "):
+        opened(log, LAWS["velocity"] | {"kd": 66.0}, "pd")
 
 
 def test_a_derivative_of_the_error_is_not_one_of_the_velocity(runs):

@@ -132,6 +132,12 @@ def test_stated_noise_that_the_log_contradicts_is_named():
     assert "readings lie on steps of 1e-06" in coarse
     (noisy,) = told("position_noise = 1e-5")
     assert noisy.startswith("position_noise = 1e-05 is stated")
+    (fine,) = told("position_noise = 1e-8")
+    assert fine.startswith("position_noise = 1e-08 is stated, and the readings lie on steps of 1e-06")
+    # The bound for the force is that of the log, whatever is stated of the position.
+    of_force, _ = told("force_noise = 0.3\nposition_noise = 1e-3")
+    bound = float(of_force.removeprefix("force_noise = 0.3 is stated, and the log has at most "))
+    assert NOISE < 1.1 * bound < 1.3 * NOISE
 
 
 def test_check_gives_the_noise_with_its_source():
