@@ -128,7 +128,31 @@ def table(records: list[dict[str, Any]]) -> str:
             f"{share[0]:.1f}-{share[1]:.1f} % | {largest} | {jointly} | {efficiency} | {blind} | "
             f"{seconds:.2f} | {commits} |"
         )
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_pooled(records)]) + "\n"
+
+
+def _pooled(records: list[dict[str, Any]]) -> list[str]:
+    """Return the lines of a table of the chosen method with all lots of a cell together."""
+    lines = [
+        "",
+        "## All lots of a cell together, method as chosen",
+        "",
+        "Lots are of different commits. Too wide or too narrow: the share is outside the range.",
+        "",
+        "| cell | runs | values | 95 % holds | range | |",
+        "|---|---|---|---|---|---|",
+    ]
+    cells: dict[str, list[dict[str, Any]]] = {}
+    for record in records:
+        if record["asked"] == "chosen":
+            cells.setdefault(record["cell"], []).append(record)
+    for cell, of in sorted(cells.items()):
+        z = np.abs([v for r in of for v in r.get("z", {}).values()])
+        share = 100 * float(np.mean(z < 1.96))
+        low, high = (100 * x / z.size for x in binom.interval(0.99, z.size, 0.95))
+        side = "too wide" if share > high else "too narrow" if share < low else ""
+        lines.append(f"| {cell} | {len(of)} | {z.size} | {share:.1f} % | {low:.1f}-{high:.1f} % | {side} |")
+    return lines
 
 
 def main() -> int:
