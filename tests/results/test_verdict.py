@@ -28,7 +28,9 @@ from jaxid.results.verdict.completeness import (
 )
 from jaxid.session import open_session
 from truth.axis.cases import case_text, write_case
+from truth.axis.machines import Setup, multisine
 from truth.axis.slow_axis import DECLARED, STRIBECK, drag_axis, slow_axis
+from truth.axis.stepper import Loop, Machine, Sensor
 
 
 def columns(setup):
@@ -392,3 +394,33 @@ def test_the_terminal_says_if_nothing_is_known_to_be_missing(verdict, complete, 
     line = verdict_line(verdict, complete)
     assert line.startswith(f"verdict: {verdict}")
     assert line.endswith("is not known)") == hedged
+
+
+@pytest.mark.slow
+def test_a_gap_far_above_the_noise_floor_is_no_complete_model():
+    """A ripple of a wrong period leaves several times the floor, in the colour of a rough command."""
+    t = np.arange(10_000) / 1000.0
+    reference = multisine(t, [0.3, 0.7, 1.3, 2.6], 1.5, 1)
+    ripple = {"amplitude": 0.15, "period": 2 * np.pi / 36, "phase": 0.5}
+    friction = {"viscous_friction": {"coefficient": 0.12}, "coulomb_friction": {"level": 0.5}}
+    law = Loop("cascade_pd", kp=40.0 / 1.2, kv=1.2, limit=np.inf, reference=reference)
+    encoder = Sensor(position_resolution=2 * np.pi / 20_000, position_noise=1e-5, force_noise=0.02)
+    machine = Machine(0.04, {**friction, "cogging": ripple})
+    run = Setup(machine, law, encoder, 1000.0, 10.0, 1).run()
+    effects = [
+        {"kind": "viscous_friction", "coefficient": {"guess": 0.08}},
+        {"kind": "coulomb_friction", "level": {"guess": 0.3}},
+        {"kind": "cogging", "amplitude": {"guess": 0.1}, "period": 0.1698, "phase": {"guess": 0.1}},
+    ]
+    case = {
+        "plant": {"kind": "axis", "motion": "rotary", "parameters": {"inertia": {"guess": 0.06}}},
+        "effects": effects,
+        "log": {"time": "t", "position": "q", "force": "u"},
+    }
+    log = {"t": run["t"], "q": run["position"], "u": run["force"]}
+    wrong = jaxid.identify(case, log)
+    assert wrong.model_complete is not True
+    assert "times the noise" in wrong.findings[0]
+    assert any("jaxid discover" in line for line in wrong.findings)
+    effects[2]["period"] = ripple["period"]
+    assert jaxid.identify(case, log).model_complete is True

@@ -48,6 +48,9 @@ _RARELY = 1e-3
 # Factor in RMS by which a residual of the right colour may exceed the noise, which is known to a few tenths,
 # and standard deviations of its scatter beyond that.
 _LOUDER, _SCATTER = 1.3, 4.0
+# Factor in RMS over the noise floor of the tables beyond which a residual is noise only if the force is read
+# with far more of it than was estimated.
+_ABOVE = 1.6
 # Part of a count that a joint must move in a sample, so that rounding is white.
 _ROUNDS_WHITE = 0.3
 # Parts of the high band of the logged force that may be noise of its reading. In a loop the rest is the
@@ -92,6 +95,11 @@ class Residual:
     def coloured(self) -> bool:
         """True if the residual has clearly more power at low frequencies than the noise."""
         return self.excess > self.limit and self.systematic > self.numerics
+
+    @property
+    def above_floor(self) -> bool:
+        """True if it is undecided because it is far above the estimated noise, though it has its colour."""
+        return self.complete is None and self.rms > _ABOVE * self.floor
 
     @property
     def within_numerics(self) -> bool:
@@ -157,8 +165,21 @@ def residuals_of(machine: Machine, run: OpenedLog, gap: ForceGap, *, fitted: boo
             numerics=float(numerics[joint]),
         )
         loud = power > _LOUDER**2 + _SCATTER / np.sqrt(max(count, 1))
-        out.append(_decided(found, count, loud=loud, stated=stated))
+        decided = _decided(found, count, loud=loud, stated=stated)
+        estimated = not stated and run.data.answer is None
+        out.append(_unlike_floor(decided) if estimated else decided)
     return out
+
+
+def _unlike_floor(found: Residual) -> Residual:
+    """Return the comparison undecided if only noise far above the estimated one explains the residual."""
+    if found.complete is not True or found.rms <= found.numerics or not found.rms > _ABOVE * found.floor:
+        return found
+    reason = (
+        f"the force gap is {found.rms / found.floor:.2g} times the noise floor; it is noise only if the "
+        "force is read with far more noise than the log shows, and [sensor] does not state that"
+    )
+    return replace(found, complete=None, reason=reason)
 
 
 _inertial = eqx.filter_jit(inertial_force)

@@ -133,7 +133,8 @@ def judge(
     findings += _completeness_words(
         session, residuals, complete, None if doubtful else search or "none", doubt
     )
-    findings += [_SEARCH] if complete is None and noisy and not search else []
+    may_lack = noisy or any(r.above_floor for r in residuals)
+    findings += [_SEARCH] if complete is None and may_lack and not search else []
     findings += contradicted_file(session, estimate)
     others = [r for r in remarks if r not in (*impossible, *contrary)]
     findings += _remark_words(others)
