@@ -107,6 +107,8 @@ _REFERENCE = (
     _Slip(_DEGREES, "the reference looks like degrees", "rotary"),
     _Slip(1.0 / _DEGREES, "position looks like degrees", "rotary"),
 )
+# Beginning of the finding that the log's inertia is off its guess by a usual error of units.
+INERTIA_DOUBT = "the log implies an inertia"
 # Inertia implied by the log over the guess of the case. A guess is often wrong by a factor of ten, so a
 # factor that a poor guess could also explain is only a warning.
 _INERTIA = (
@@ -372,7 +374,7 @@ def _judge_inertia(rough: float | None, guess: float, span: float, motion: str, 
     for slip in _INERTIA:
         spread = 2.0 if slip.severity == "warning" else 5.0
         if slip.matches(rough / guess, motion, spread):
-            what = f"the log implies an inertia of about {rough:.2g}, the guess is {guess:.3g}"
+            what = f"{INERTIA_DOUBT} of about {rough:.2g}, the guess is {guess:.3g}"
             hint = how_to_say(slip.text, "convert the log to SI units")
             hint += "; else check actuator.gain, or correct the guess"
             # A guess may be wrong by a factor of 57; an angle of more than 20 indicates degrees.

@@ -208,6 +208,17 @@ def test_more_than_noise_is_not_called_noise(changed, within):
     assert replace(SMALL, **changed).within_numerics == within
 
 
+def test_a_doubt_on_the_unit_of_the_force_comes_first(tmp_path):
+    setup = slow_axis(1, duration=4.0)
+    path = write_case(tmp_path, case_text(setup, [*DECLARED, STRIBECK], sensor=False, closed=False))
+    log = columns(setup)
+    log["u"] = 1e3 * log["u"]
+    result = jaxid.identify(path, log, method="inverse_dynamics")
+    assert result.model_complete is not True
+    assert result.findings[0].startswith("A unit is in doubt: the log implies an inertia")
+    assert "force looks like thousandths of its unit" in result.findings[0]
+
+
 def test_files_and_report_say_the_same(missing, complete, tmp_path):
     for result, badge in ((missing, "the model is incomplete"), (complete, "5 parameters identified")):
         folder = result.save(tmp_path / badge.replace(" ", "_"))

@@ -17,6 +17,7 @@ from jaxid.estimators.estimate import Estimate
 from jaxid.estimators.force_timing import delay_words
 from jaxid.estimators.several.parts import parts_of
 from jaxid.gap import DRIFTED, Gap
+from jaxid.logs.units_check import INERTIA_DOUBT
 from jaxid.machine import Machine
 from jaxid.names import LEAVE_ROWS_OUT, SIMULATE_THE_LOOP
 from jaxid.results.report.numbers import percent, plain, scaled_unit
@@ -100,7 +101,8 @@ def judge(
 
     remarks = remarks_on(session, estimate)
     noisy = needed_noise(session, estimate)
-    doubt = _doubt(remarks, reading) or noisy
+    units = _unit_words(session)
+    doubt = _doubt(remarks, reading) or ("a unit is in doubt" if units else noisy)
     complete = None if complete and doubt else complete
     blind = undetermined(estimate)
     identified = len(blind) < len(estimate.names) or not estimate.names
@@ -111,7 +113,7 @@ def judge(
 
     contrary = [r for r in remarks if r.contradicts and r not in impossible]
 
-    findings = _scale_words(session)
+    findings = units + _scale_words(session)
     findings += [] if estimate.converged else [f"The fit did not converge: {estimate.message}."]
     findings += _delay_words(estimate)
     findings += _clipped_words(session, estimate)
@@ -141,6 +143,12 @@ def judge(
     drifted = _drifted(session, gaps)
     findings += drifted
     return Judgement(complete, not against, identified, tuple(findings), bool(drifted), residuals)
+
+
+def _unit_words(session: Session) -> list[str]:
+    """Return a sentence on a unit that is in doubt, as the inertia of the log is far from its guess."""
+    doubts = [f for f in session.findings if f.what.startswith(INERTIA_DOUBT)]
+    return [f"A unit is in doubt: {doubts[0].what}; {doubts[0].hint}."] if doubts else []
 
 
 def _scale_words(session: Session) -> list[str]:
