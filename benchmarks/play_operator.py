@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import differential_evolution
 
+from jaxid.numerics.delays import lagged, shifted
+
 # Largest delay and lag [s], half width and offset [rad] that are tried.
 BOUNDS = ((0.0, 0.2), (1e-3, 0.2), (0.0, 0.15), (-0.1, 0.1))
 # Sets of numbers of one generation, and generations.
@@ -24,17 +26,14 @@ def followed(numbers: jax.Array, command: jax.Array, start: jax.Array, row: jax.
     `row` the time between two rows [s].
     """
     delay, lag, half, offset = numbers
-    rows = jnp.arange(len(command), dtype=command.dtype)
-    delayed = jnp.interp(rows - delay / row, rows, command)
-    kept = jnp.exp(-row / lag)
+    delayed = shifted(command[:, None], delay / row)
+    wanted = lagged(delayed, 1 - jnp.exp(-row / lag))[:, 0]
 
-    def step(state: tuple[jax.Array, jax.Array], wanted: jax.Array) -> tuple[tuple, jax.Array]:
-        lagged, at = state
-        lagged = kept * lagged + (1 - kept) * wanted
-        at = jnp.clip(at, lagged - half, lagged + half)
-        return (lagged, at), at + offset
+    def step(at: jax.Array, middle: jax.Array) -> tuple[jax.Array, jax.Array]:
+        at = jnp.clip(at, middle - half, middle + half)
+        return at, at + offset
 
-    _, positions = jax.lax.scan(step, (delayed[0], start - offset), delayed)
+    _, positions = jax.lax.scan(step, start - offset, wanted)
     return positions
 
 

@@ -280,7 +280,7 @@ def main() -> None:
         record = run(joint, logs)
         # Read now: another joint may have ended meanwhile.
         content = json.loads(kept.read_text()) if kept.exists() else {"joints": []}
-        if "compared" not in content:
+        if "play" not in content.get("compared", {}):
             model = mujoco.MjModel.from_xml_path(str(data / "so101.xml"))
             model.opt.timestep = STEP
             content["compared"] = compared(model, logs)

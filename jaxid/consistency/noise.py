@@ -289,13 +289,13 @@ def _in_band(
 
 def _with_position_noise_of_log(machine: Machine, log: Log) -> Machine:
     """Return a machine without the stated noise of positions, if that is far above what the log can have."""
-    stated = machine.sensor.position_std
+    stated = machine.sensor.position_noise
     if stated is None or log.integrated:
         return machine
     shown = signals.high_band_std(log.filled)
     if not np.any((np.asarray(stated) > _FACTOR * shown) & np.array(log.measured)):
         return machine
-    return replace(machine, sensor=replace(machine.sensor, position_noise=None, position_resolution=None))
+    return replace(machine, sensor=replace(machine.sensor, position_noise=None))
 
 
 def _at(machine: Machine, fit: BalanceFit, values: np.ndarray) -> Machine:

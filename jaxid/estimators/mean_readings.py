@@ -102,7 +102,7 @@ def far_from_logs(
 ) -> bool:
     """Check that a model is incomplete: noise in its loop does not explain what a fit without noise leaves.
 
-    The log counts of which the fit leaves most.
+    Noise is simulated only in the log of which the fit leaves most.
 
     Args:
         parts: The logs.
@@ -110,12 +110,10 @@ def far_from_logs(
         numerics: Settings of the integration; None: chosen from machines and logs.
         times: RMS over the noise of a reading from which a model is far from a log.
     """
-    ends = np.cumsum([part.log.samples for part in parts])[:-1]
-    offs = np.split(estimate.residual, ends)
-    left = [_over_noise(part, off) for part, off in zip(parts, offs, strict=True)]
-    worst = parts[int(np.argmax(left))]
+    left = left_over_noise(parts, estimate)
     if max(left) <= times:
         return False
+    worst = parts[int(np.argmax(left))]
     at = worst.at(estimate.theta)
     [noise] = noise_of_parts([worst], estimate.theta, numerics)
     if noise is None:
@@ -124,6 +122,13 @@ def far_from_logs(
     replay = replay.following(at.parameters.places, jnp.asarray(at.parameters.guess))
     mean = np.asarray(mean_readings(noise.on(replay), at.plant))
     return _over_noise(worst, worst.log.filled - mean) > times
+
+
+def left_over_noise(parts: Sequence[Part], estimate: Estimate) -> list[float]:
+    """Return the RMS left of each log's positions over the noise of a reading, that of the worst joint."""
+    ends = np.cumsum([part.log.samples for part in parts])[:-1]
+    offs = np.split(estimate.residual, ends)
+    return [_over_noise(part, off) for part, off in zip(parts, offs, strict=True)]
 
 
 def _over_noise(part: Part, off: Float[np.ndarray, "time n"]) -> float:

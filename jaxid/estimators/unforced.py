@@ -22,7 +22,7 @@ from jaxid.estimators.apart.whole import arm_steps, start_by_joints, whole_steps
 from jaxid.estimators.coarse_starts import coarse_starts
 from jaxid.estimators.effort import SCALE, Scale, scale_by_effort
 from jaxid.estimators.estimate import Estimate, misfit
-from jaxid.estimators.mean_readings import far_from_logs, fitted_with_noise
+from jaxid.estimators.mean_readings import far_from_logs, fitted_with_noise, left_over_noise
 from jaxid.estimators.output_error import output_error_steps
 from jaxid.estimators.servo_law import beside_other_law, leaves_law_open, with_law_of_log
 from jaxid.estimators.servo_rate import leaves_course_open, leaves_rate_open, with_rate_of_log
@@ -131,7 +131,7 @@ def _fitted_steps(
     fit = output_error_steps if by_joints is None or without_noise else whole_steps
     fit = partial(fit, fitted, parts, numerics=numerics, **options)
     result = yield from _best_of(fit, starts)
-    if base is not None and by_joints is None and _leaves_more_than_noise(result, parts):
+    if base is not None and by_joints is None and max(left_over_noise(parts, result)) > _FAR:
         ratios = [name for k, name in enumerate(machine.parameters.names) if k in group and k != base]
         others = coarse_starts(fitted, parts, chosen, ratios=ratios)
         others = [start for start in others if not np.array_equal(start, fitted.parameters.guess)]
@@ -160,14 +160,6 @@ def _best_of(
 def _order(estimate: Estimate) -> tuple[bool, float]:
     """Return a key by which fits of the same logs compare, the least one that of the best fit."""
     return not estimate.converged, misfit(estimate)
-
-
-def _leaves_more_than_noise(estimate: Estimate, parts: Sequence[Part]) -> bool:
-    """Check that a fit leaves clearly more of the positions than the noise of their encoders."""
-    counted = np.maximum(np.isfinite(estimate.residual).sum(axis=0), 1)
-    left = np.sqrt(np.nansum(np.square(estimate.residual), axis=0) / counted)
-    noise = np.max([position_noise(part.machine, part.log) for part in parts], axis=0)
-    return bool(np.any(left > _FAR * noise))
 
 
 def _by_mean_readings(

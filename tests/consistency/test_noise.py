@@ -140,6 +140,11 @@ def test_stated_noise_that_the_log_contradicts_is_named():
     assert NOISE < 1.1 * bound < 1.3 * NOISE
 
 
+def test_a_wrong_noise_of_the_position_does_not_change_that_of_the_force():
+    session = opened(setup(), sensor="[sensor]\nposition_noise = 1e-3\n")
+    assert session.fit.data.force_noise == pytest.approx(NOISE, rel=0.1)
+
+
 def test_check_gives_the_noise_with_its_source():
     of = setup()
     run = of.run()
